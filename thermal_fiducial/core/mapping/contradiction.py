@@ -16,7 +16,6 @@ from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.localization import DECISIVE, names
 from thermal_fiducial.core.mapping.located import (
-    CONTRADICTION,
     error_std_px,
     LocatedFrame,
     Location,
@@ -27,6 +26,7 @@ from thermal_fiducial.core.mapping.located import (
 )
 from thermal_fiducial.core.mapping.trust import DISAGREEMENT
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
+from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Markers that must have agreed with odometry for it to count against another: two against one.
@@ -102,31 +102,29 @@ class MisplacedMarkers:
         #: stamp of the last pose that contradicted it [ns]
         self._contradicted_ns: int | None = None
 
-    def checked(self, location: Location, predicted: CameraPose | None) -> Location | Refusal:
-        """The ``location``, or why there is none from a misplaced marker; ``predicted``: the camera by odometry."""
-        ids, stamp_ns = location.pose.marker_ids, location.pose.stamp_ns
-        if len(ids) > 1:
-            return location
+    def checked(self, frame: LocatedFrame) -> LocatedFrame:
+        """The ``frame``, without its pose if that is from a misplaced marker."""
+        outcome = frame.outcome
+        if isinstance(outcome, Refusal) or len(outcome.pose.marker_ids) > 1:
+            return frame
         known = self._misplaced
-        if known is None or not 0 <= stamp_ns - known.since_ns < _FORGOTTEN_NS:
-            found = self._found(location, predicted)
-        else:
-            found = known if known.id == ids[0] and not _is_back(known, location.pose, predicted) else None
-        return location if found is None else Refusal(found.reason, misplaced=found)
+        if known is None or not 0 <= frame.stamp_ns - known.since_ns < _FORGOTTEN_NS:
+            known = self._at_first_sight(frame, outcome)
+        elif known.id not in outcome.pose.marker_ids or _is_back(known, outcome.pose, frame.predicted):
+            known = None
+        return frame if known is None else replace(frame, outcome=Refusal(known.reason, misplaced=known))
 
-    def _found(self, location: Location, predicted: CameraPose | None) -> MisplacedMarker | None:
-        """The only marker in view if it is misplaced at first sight."""
-        pose, contradicted_ns = location.pose, self._contradicted_ns
-        (marker_id,) = pose.marker_ids
-        drifting = contradicted_ns is not None and 0 <= pose.stamp_ns - contradicted_ns < _BEFORE_NS
-        if predicted is None or drifting or len(self._witnesses - {marker_id}) < _WITNESSES:
+    def _at_first_sight(self, frame: LocatedFrame, location: Location) -> MisplacedMarker | None:
+        """The only marker of ``location`` if it is misplaced."""
+        (marker_id,), contradicted_ns = location.pose.marker_ids, self._contradicted_ns
+        drifting = contradicted_ns is not None and 0 <= frame.stamp_ns - contradicted_ns < _BEFORE_NS
+        outvoted = len(self._witnesses - {marker_id}) >= _WITNESSES
+        if frame.predicted is None or not frame.contradicts_odometry or drifting or not outvoted:
             return None
-        T_moved = pose.T_map_camera @ inverse(predicted.T_map_camera)
+        T_moved = location.pose.T_map_camera @ inverse(frame.predicted.pose.T_map_camera)
         T_map_marker = location.sight.T_map_marker[0]
         distance = float(np.linalg.norm((inverse(T_moved) @ T_map_marker - T_map_marker)[:3, 3]))
-        if distance < _FAR or squared_distance(pose, predicted) < CONTRADICTION:
-            return None
-        return MisplacedMarker(marker_id, pose.stamp_ns, T_moved, distance)
+        return MisplacedMarker(marker_id, frame.stamp_ns, T_moved, distance) if distance >= _FAR else None
 
     def add(self, frame: LocatedFrame) -> None:
         """Update with a frame and its outcome."""
@@ -146,12 +144,12 @@ class MisplacedMarkers:
             self._misplaced = None
 
 
-def _is_back(misplaced: MisplacedMarker, pose: CameraPose, predicted: CameraPose | None) -> bool:
+def _is_back(misplaced: MisplacedMarker, pose: CameraPose, predicted: PredictedCamera | None) -> bool:
     """Whether a marker is rather in its place in the map than where it was found, by odometry."""
     if predicted is None:
         return False
     elsewhere = in_moved_map(pose, inverse(misplaced.T_moved))
-    return squared_distance(elsewhere, predicted) - squared_distance(pose, predicted) > DECISIVE
+    return squared_distance(elsewhere, predicted.pose) - squared_distance(pose, predicted.pose) > DECISIVE
 
 
 def _distances(sight: Sight, camera: Camera, predicted: CameraPose) -> FloatArray:

@@ -125,7 +125,8 @@ class MarkerMapper:
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
-        return LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome)
+        frame = LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome)
+        return self._misplaced.checked(frame)
 
     def _located(
         self, stamp_ns: int, sight: Sight, camera: Camera, predicted: PredictedCamera | None
@@ -137,11 +138,9 @@ class MarkerMapper:
         T_expected = None if expected is None else expected.T_map_camera
         fit = partial(locate, stamp_ns, camera=camera, prior=T_expected, model=self._errors)
         found = fit(sight)
-        if not isinstance(found, Refusal) and are_two_that_contradict(found):
-            found = contradicting(sight) if predicted is None else settled(found, camera, predicted.pose, fit)
-        if isinstance(found, Refusal):
+        if isinstance(found, Refusal) or not are_two_that_contradict(found):
             return found
-        return self._misplaced.checked(found, None if predicted is None else predicted.pose)
+        return contradicting(sight) if predicted is None else settled(found, camera, predicted.pose, fit)
 
     @property
     def _errors(self) -> SystematicErrors:
@@ -157,7 +156,6 @@ class MarkerMapper:
         """Second half of :meth:`process`: updates errors, quarantine and new markers with the frame located last."""
         outcome, waiting = frame.outcome, Waiting()
         changed = updated = False
-        self._misplaced.add(frame)
         if isinstance(outcome, Refusal):
             changed, waiting = self._without_pose(frame, outcome)
         elif frame.contradicts_odometry and self._odometry_agreed:
@@ -177,6 +175,7 @@ class MarkerMapper:
                 if not frame.is_known.all():
                     placed, waiting = self._place_new(frame, outcome.viewpoint)
                     changed |= placed
+        self._misplaced.add(frame)
         return MapperResult(
             frame.stamp_ns, frame.pose, outcome.reason, changed, frozenset(frame.known.observed.ids.tolist()), waiting,
             dict(self._trust.quarantined), not self.frozen and (changed or updated),
