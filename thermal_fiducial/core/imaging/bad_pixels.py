@@ -123,6 +123,8 @@ class BadPixelFiller:
 
     def fill(self, counts: Counts) -> None:
         """Replace the pixels of ``counts`` (a contiguous frame) in place."""
+        if not len(self._target):
+            return
         flat = counts.reshape(-1)
         flat[self._target] = np.median(flat[self._around], axis=1)
 
