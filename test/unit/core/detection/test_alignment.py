@@ -1,5 +1,6 @@
 """Rough outlines pulled onto the pattern."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -32,6 +33,18 @@ def test_a_corner_off_by_most_of_a_cell_comes_back(turn, contrast):
     found = np.roll(aligned(image, seen, np.array([13]), np.array([turn]), DECODER)[0], turn, axis=0)
     # A third of a cell, from where the refinement finds the sides; 0.9 px when written.
     assert np.abs(found - CORNERS).max() < CELL / 3.0
+
+
+def test_what_else_is_in_the_image_does_not_matter():
+    rough = (CORNERS + 1.5)[None]
+    image = picture(13, 40.0, noise=1.0)
+    larger = cv2.copyMakeBorder(image, 60, 50, 70, 80, cv2.BORDER_REPLICATE)
+    here, there = (
+        aligned(view, quads, np.array([13]), np.zeros(1, dtype=np.int64), DECODER)
+        for view, quads in ((image, rough), (larger, rough + np.array([70.0, 60.0])))
+    )
+    # single precision of counts about another mean
+    np.testing.assert_allclose(there - np.array([70.0, 60.0]), here, atol=1e-3)
 
 
 def test_what_shows_nothing_stays_finite():

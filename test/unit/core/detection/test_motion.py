@@ -1,9 +1,10 @@
 """Motion of the camera from frame to frame."""
 
 import numpy as np
+from support.scenes import motion_prior
 
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
-from thermal_fiducial.core.detection.tracking import MotionTrack
+from thermal_fiducial.core.detection.tracking import MotionTrack, predict_frame
 from thermal_fiducial.core.detection.twist import interaction, Twist, twist_by_odometry
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -160,7 +161,7 @@ def test_a_late_frame_disturbs_nothing_and_a_clock_set_back_is_followed():
 
 
 def test_motion_that_shows_no_markers_is_forgotten():
-    """A wrong one would blur them away in frame after frame."""
+    """A wrong one would blur them away in frame after frame; the filter's states are heard all the same."""
     tracker, period_ns = MotionTrack.of_rig(np.eye(4)), 33_333_333
     tracker = tracker.after(
         0,
@@ -171,3 +172,7 @@ def test_motion_that_shows_no_markers_is_forgotten():
         twist = tracker.predict(frame * period_ns)
         assert (twist is None) == (frame * period_ns > 150_000_000)
         tracker = tracker.after(frame * period_ns, twist, ExpectedMarkers.none())
+    state = Odometry(8 * period_ns, np.eye(4), TWIST[:3], TWIST[3:], 1e-6 * np.eye(6), 1e-6 * np.eye(6))
+    # The twist of which nothing is known pulls by its share of the variance.
+    heard = predict_frame(8 * period_ns, motion_prior(state), tracker, 0.2).twist
+    np.testing.assert_allclose(heard.value, TWIST, atol=1e-5)
