@@ -160,13 +160,14 @@ def two_places(residuals: FloatArray, J: FloatArray, outlying: BoolArray) -> boo
     residuals, J : (n, 8), (n, 8, 6), whitened, of all views of one marker, J with respect to its pose
     outlying : (n,)
     """
-    # Residuals are not finite for a marker in the plane of the camera, in a diverged map.
-    outlying = outlying & np.isfinite(residuals).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
+    norms = np.linalg.norm(residuals, axis=-1)
+    # In a diverged map residuals are zero for a marker behind the camera, and not finite for one in its plane.
+    outlying = outlying & np.isfinite(norms) & (norms > 0.0) & np.isfinite(J).all(axis=(1, 2))
     count = np.count_nonzero(outlying)
     if count < _FEWEST or count < _LEAST * len(residuals):
         return False
     # Views are normalised, so that a linear step suffices whatever the size of their residuals.
-    norms = np.linalg.norm(residuals[outlying], axis=-1)
+    norms = norms[outlying]
     r = (residuals[outlying] / norms[:, None]).ravel()
     A = (J[outlying] / norms[:, None, None]).reshape(-1, 6)
     step, *_ = np.linalg.lstsq(A, r, rcond=None)

@@ -18,3 +18,9 @@ def test_outliers_that_agree_are_a_second_pose_and_others_are_not():
     # A few frames, or a few in a hundred, are no evidence.
     few = np.arange(views) < 9
     assert not two_places(np.where(few[:, None], J @ np.full(6, 0.05), noise), J, few)
+
+
+def test_views_from_behind_show_no_second_pose():
+    """They have no residuals, and so no direction."""
+    residuals, J = np.zeros((20, 8)), np.zeros((20, 8, 6))
+    assert not two_places(residuals, J, np.ones(20, dtype=bool))
