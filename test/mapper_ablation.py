@@ -73,8 +73,8 @@ MECHANISMS = {
     ),
     'bridging': Mechanism(
         ('chain', 'tags test_22'),
-        ('keyframes:FrameMemory.bridge', 'keyframes:FrameMemory.bridgeable', 'keyframes:displacement_covariance'),
-        {'keyframes:FrameMemory.bridgeable': lambda *_, **__: False},
+        ('keyframes:KeyframeStore.bridge', 'keyframes:KeyframeStore.bridgeable', 'keyframes:displacement_covariance'),
+        {'keyframes:KeyframeStore.bridgeable': lambda *_, **__: False},
     ),
     'two cameras of a candidate': Mechanism(
         ('small markers', 'tags test_16'),

@@ -26,13 +26,13 @@ _CELL_M = 0.25
 _CELL_DIRECTION = 0.25
 # Share of the budget to which the store is thinned, so that it is thinned seldom.
 _THINNED = 0.85
-# A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
-_GROWTH, _FEW = 0.2, 15
-#: Views of markers that a refinement in flight takes: a second or two of a slow core.
-VIEWS = 10_000
-# Time between two refinements for each view of the last [s]: a view takes a third of it on a slow core. With three
-# times as much, poses from markers just placed along a chain were too vague to publish: 19 of 633 over a carpet.
-_PERIOD_A_VIEW = 3e-4
+# A refinement is worth its time when so many keyframes have come since the last one.
+_FEW = 15
+#: Views that a refinement in flight takes: so many of each marker, but in all neither fewer nor more than this. Over a
+#: carpet of 72 tags 3,000 views, one in four, give the map of all views; 10,000 take a second or two of a slow core.
+VIEWS_A_MARKER, FEWEST_VIEWS, MOST_VIEWS = 30, 3_000, 10_000
+# Time between two refinements for each view of the last [s]: a view takes a fifth of it on a slow core.
+_PERIOD_A_VIEW = 6e-4
 
 
 @dataclass(frozen=True)
@@ -105,23 +105,101 @@ class Displacement:
         return np.asarray(self.T_new_old[min(near, key=lambda i: abs(int(self.stamps_ns[i]) - stamp_ns))])
 
 
-@dataclass
-class KeyframeStore:
-    """At most ``budget`` keyframes, thinned out evenly over camera positions and viewing directions."""
+@dataclass(frozen=True)
+class LastAdjustment:
+    """When an adjustment was last begun, and with what."""
 
-    budget: int
-    frames: dict[int, Keyframe] = field(default_factory=dict)
-    #: stamps of keyframes that only odometry connects with the others: never dropped
-    bridges: set[int] = field(default_factory=set)
-    #: frames that were ever added
+    #: stamp of its newest keyframe, its views and markers, and the frames that had been added until then
+    stamp_ns: int = 0
+    views: int = 0
+    markers: int = 0
     added: int = 0
+
+
+class KeyframeStore:
+    """Keyframes of a flight, thinned out evenly over camera positions and viewing directions, and the last adjustment.
+
+    Parameters
+    ----------
+    budget : keyframes at most
+    marker_map : the map to begin with
+    """
+
+    def __init__(self, budget: int, marker_map: MarkerMap) -> None:
+        self._budget = budget
+        #: by stamp
+        self.frames: dict[int, Keyframe] = {}
+        #: stamps of keyframes that only odometry connects with the others: never dropped
+        self.bridges: set[int] = set()
+        self._priors = prior_poses(marker_map.markers)
+        self._adjustment = LastAdjustment(markers=len(marker_map.markers))
+        #: frames that were ever added
+        self._added = 0
+        self._camera: Camera | None = None
+        #: stamp of the last frame with known markers [ns]; None: not yet
+        self._last_ns: int | None = None
+        #: pose by odometry at the first unmapped marker of the present gap
+        self._gap: CameraPose | None = None
 
     def add(self, frame: Keyframe) -> None:
         """Keep ``frame``; thin out when there are too many."""
         self.frames[frame.stamp_ns] = frame
-        self.added += 1
-        if len(self.frames) > self.budget:
-            self._thin(int(_THINNED * self.budget))
+        self._added += 1
+        if len(self.frames) > self._budget:
+            kept = self._spread(int(_THINNED * self._budget))
+            self.frames = {stamp: frame for stamp, frame in self.frames.items() if stamp in kept}
+
+    def keep(self, seen: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
+        """Keep a frame with a known camera pose and at least two markers."""
+        self._last_ns, self._gap = pose.stamp_ns, None
+        if len(seen.ids) >= 2:
+            self.add(self._keyframe(seen, pose, camera, predicted))
+
+    def bridge(self, seen: Observations, camera: Camera, predicted: PredictedCamera, *, first: bool) -> Viewpoint:
+        """Keep a frame without a known marker; returns the viewpoint of its markers, by odometry.
+
+        Only odometry connects these markers with the map. Its error at the ``first`` of them is common to all that
+        follow in the gap, since the markers connect the later frames.
+        """
+        keyframe = self._keyframe(seen, predicted.pose, camera, predicted)
+        if first:
+            information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
+            self.bridges.add(keyframe.stamp_ns)
+            self.add(replace(keyframe, information=information))
+        elif len(seen.ids) >= 2:
+            self.add(keyframe)
+        if self._gap is None:
+            self._gap = predicted.pose
+        # The covariance of the odometry at the gap's first marker is the common error of all views.
+        return Viewpoint.known(
+            predicted.pose.T_map_camera, displacement_covariance(self._gap, predicted), self._gap.covariance
+        )
+
+    def bridgeable(self, stamp_ns: int, longest: float) -> bool:
+        """Whether known markers were in view not more than ``longest`` [s] before."""
+        return self._last_ns is not None and 0 <= stamp_ns - self._last_ns <= longest * SECOND_NS
+
+    def refinement_due(self, stamp_ns: int, period: float, markers: int) -> bool:
+        """Whether an adjustment of ``markers`` markers is due, at least ``period`` [s] after the last one."""
+        if not self.frames or period == 0.0:
+            return False
+        last = self._adjustment
+        wait_ns = max(period, _PERIOD_A_VIEW * last.views) * SECOND_NS
+        # A clock that was set back leaves the last one in the future.
+        if 0 <= stamp_ns - last.stamp_ns < wait_ns:
+            return False
+        return self._added - last.added >= _FEW or markers > last.markers
+
+    def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int | None = None) -> Snapshot | None:
+        """Input of an adjustment, with about ``views`` views at most, by default in flight; None without keyframes."""
+        if not self.frames:
+            return None
+        markers = len(marker_map.markers)
+        frames = self._selected(views or min(max(VIEWS_A_MARKER * markers, FEWEST_VIEWS), MOST_VIEWS))
+        number = sum(len(frame.ids) for frame in frames)
+        self._adjustment = LastAdjustment(next(reversed(self.frames)), number, markers, self._added)
+        trusted = {key: marker for key, marker in marker_map.markers.items() if marker.trusted}
+        return snapshot_of(trusted, frames, self._priors, marker_map.revision, errors)
 
     def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
         """Take over adjusted poses by stamp; other keyframes move with the nearest adjusted one in time."""
@@ -136,17 +214,24 @@ class KeyframeStore:
         }
         return displacement
 
-    def selected(self, views: int) -> tuple[Keyframe, ...]:
+    def _keyframe(
+        self, seen: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None
+    ) -> Keyframe:
+        if self._camera is None or not camera.matches(self._camera):
+            self._camera = camera
+        frame = Keyframe(pose.stamp_ns, pose.T_map_camera, self._camera, seen.ids, seen.corners, seen.covariances)
+        if predicted is None:
+            return frame
+        information = np.asarray(np.linalg.inv(of_correlated_odometry(predicted.pose.covariance)), dtype=np.float64)
+        return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
+
+    def _selected(self, views: int) -> tuple[Keyframe, ...]:
         """Keyframes with about ``views`` views of markers at most, spread over the map like all of them."""
         total = sum(len(frame.ids) for frame in self.frames.values())
         if total <= views:
             return tuple(self.frames.values())
         kept = self._spread(max(len(self.frames) * views // total, 1))
         return tuple(frame for stamp, frame in self.frames.items() if stamp in kept)
-
-    def _thin(self, room: int) -> None:
-        kept = self._spread(room)
-        self.frames = {stamp: frame for stamp, frame in self.frames.items() if stamp in kept}
 
     def _spread(self, room: int) -> set[int]:
         """Stamps of about ``room`` keyframes from all places and directions, and of all bridges."""
@@ -187,92 +272,3 @@ def _fair_share(counts: list[int], room: int) -> int:
     while sum(min(count, share + 1) for count in counts) <= room and share < max(counts):
         share += 1
     return share
-
-
-class FrameMemory:
-    """Keyframes of a flight, gaps between known markers, and the time of the last adjustment.
-
-    Parameters
-    ----------
-    budget : keyframes at most
-    marker_map : the map to begin with
-    """
-
-    def __init__(self, budget: int, marker_map: MarkerMap) -> None:
-        self._keyframes = KeyframeStore(budget)
-        self._camera: Camera | None = None
-        #: stamp of the last frame with known markers [ns]; None: not yet
-        self._last_ns: int | None = None
-        #: pose by odometry at the first unmapped marker of the present gap
-        self._gap: CameraPose | None = None
-        self._priors = prior_poses(marker_map.markers)
-        self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(marker_map.markers)
-        self._added_then, self._refined_views = 0, 0
-
-    def keep(self, seen: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
-        """Keep a frame with a known camera pose and at least two markers."""
-        self._last_ns, self._gap = pose.stamp_ns, None
-        if len(seen.ids) >= 2:
-            self._keyframes.add(self._keyframe(seen, pose, camera, predicted))
-
-    def bridge(self, seen: Observations, camera: Camera, predicted: PredictedCamera, *, first: bool) -> Viewpoint:
-        """Keep a frame without a known marker; returns the viewpoint of its markers, by odometry.
-
-        Only odometry connects these markers with the map. Its error at the ``first`` of them is common to all that
-        follow in the gap, since the markers connect the later frames.
-        """
-        keyframe = self._keyframe(seen, predicted.pose, camera, predicted)
-        if first:
-            information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
-            self._keyframes.bridges.add(keyframe.stamp_ns)
-            self._keyframes.add(replace(keyframe, information=information))
-        elif len(seen.ids) >= 2:
-            self._keyframes.add(keyframe)
-        if self._gap is None:
-            self._gap = predicted.pose
-        # The covariance of the odometry at the gap's first marker is the common error of all views.
-        return Viewpoint.known(
-            predicted.pose.T_map_camera, displacement_covariance(self._gap, predicted), self._gap.covariance
-        )
-
-    def bridgeable(self, stamp_ns: int, longest: float) -> bool:
-        """Whether known markers were in view not more than ``longest`` [s] before."""
-        return self._last_ns is not None and 0 <= stamp_ns - self._last_ns <= longest * SECOND_NS
-
-    def refinement_due(self, stamp_ns: int, period: float, markers: int) -> bool:
-        """Whether an adjustment of ``markers`` markers is due, at least ``period`` [s] after the last one."""
-        if not self._keyframes.frames or period == 0.0:
-            return False
-        wait_ns = max(period, _PERIOD_A_VIEW * self._refined_views) * SECOND_NS
-        # A clock that was set back leaves the last one in the future.
-        if 0 <= stamp_ns - self._refined_ns < wait_ns:
-            return False
-        enough = self._keyframes.added - self._added_then >= _GROWTH * self._refined_frames + _FEW
-        return enough or markers > self._refined_markers
-
-    def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int) -> Snapshot | None:
-        """Input of an adjustment, with about ``views`` views of markers at most; None without keyframes."""
-        if not self._keyframes.frames:
-            return None
-        frames = self._keyframes.selected(views)
-        self._refined_ns = next(reversed(self._keyframes.frames))
-        self._refined_frames, self._refined_markers = len(self._keyframes.frames), len(marker_map.markers)
-        self._refined_views = sum(len(frame.ids) for frame in frames)
-        self._added_then = self._keyframes.added
-        trusted = {key: marker for key, marker in marker_map.markers.items() if marker.trusted}
-        return snapshot_of(trusted, frames, self._priors, marker_map.revision, errors)
-
-    def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
-        """Take over adjusted camera poses (4, 4) by stamp; returns the displacement of the map."""
-        return self._keyframes.move(adjusted)
-
-    def _keyframe(
-        self, seen: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None
-    ) -> Keyframe:
-        if self._camera is None or not camera.matches(self._camera):
-            self._camera = camera
-        frame = Keyframe(pose.stamp_ns, pose.T_map_camera, self._camera, seen.ids, seen.corners, seen.covariances)
-        if predicted is None:
-            return frame
-        information = np.asarray(np.linalg.inv(of_correlated_odometry(predicted.pose.covariance)), dtype=np.float64)
-        return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)

@@ -26,7 +26,7 @@ from thermal_fiducial.core.mapping.contradiction import (
     MisplacedMarkers,
     settled,
 )
-from thermal_fiducial.core.mapping.keyframes import FrameMemory, VIEWS
+from thermal_fiducial.core.mapping.keyframes import KeyframeStore
 from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import jump, MapperResult, MarkerMap
@@ -92,7 +92,7 @@ class MarkerMapper:
         self._last: CameraPose | None = None
         #: whether odometry has agreed with the markers since the map was loaded
         self._odometry_agreed = False
-        self._memory = FrameMemory(self.config.keyframe_budget, self._initial)
+        self._keyframes = KeyframeStore(self.config.keyframe_budget, self._initial)
 
     def process(
         self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None
@@ -171,7 +171,7 @@ class MarkerMapper:
             # Step 8: new markers placed relative to the camera.
             if not self.frozen:
                 self._count(frame)
-                self._memory.keep(frame.observed, outcome.pose, frame.camera, frame.predicted)
+                self._keyframes.keep(frame.observed, outcome.pose, frame.camera, frame.predicted)
                 if not frame.is_known.all():
                     placed, waiting = self._place_new(frame, outcome.viewpoint)
                     changed |= placed
@@ -201,28 +201,28 @@ class MarkerMapper:
             return False, {}
         if refusal.viewpoint is not None:
             return self._place_new(frame, refusal.viewpoint)
-        if predicted is None or not self._memory.bridgeable(frame.stamp_ns, longest):
+        if predicted is None or not self._keyframes.bridgeable(frame.stamp_ns, longest):
             return False, {}
         # No known marker is in view: the camera pose is that of the odometry.
         first = not any(key in self._new.candidates for key in frame.new.ids.tolist())
-        return self._place_new(frame, self._memory.bridge(frame.new, frame.camera, predicted, first=first))
+        return self._place_new(frame, self._keyframes.bridge(frame.new, frame.camera, predicted, first=first))
 
     def refinement_due(self, stamp_ns: int) -> bool:
         """Whether there are enough new keyframes since the last bundle adjustment for another."""
         if self.frozen:
             return False
-        return self._memory.refinement_due(stamp_ns, self.config.refinement_period, len(self.map.markers))
+        return self._keyframes.refinement_due(stamp_ns, self.config.refinement_period, len(self.map.markers))
 
-    def snapshot(self, views: int = VIEWS) -> Snapshot | None:
+    def snapshot(self, views: int | None = None) -> Snapshot | None:
         """Input of ``bundle_adjustment.refine``; None without keyframes.
 
         The snapshot is immutable: the refinement may run elsewhere while frames are processed.
 
         Parameters
         ----------
-        views : approximate largest number of views of markers, which bounds the time
+        views : approximate largest number of views of markers, which bounds the time; None: as in flight
         """
-        return self._memory.snapshot(self.map, self._errors, views)
+        return self._keyframes.snapshot(self.map, self._errors, views)
 
     def refine(self) -> AdjustedMap | None:
         """Run a bundle adjustment of all keyframes and apply it: for tools, where time does not matter."""
@@ -243,7 +243,7 @@ class MarkerMapper:
             return False
         self.map.adjust(refinement.markers)
         self._trust.flag(self.map.markers, refinement.inconsistent)
-        self._new.move(self._memory.move(refinement.keyframes))
+        self._new.move(self._keyframes.move(refinement.keyframes))
         self.resets += 1
         return True
 

@@ -7,6 +7,7 @@ from support.walls import CAMERA, flight
 
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 
 
 def frame(stamp, T):
@@ -14,7 +15,7 @@ def frame(stamp, T):
 
 
 def test_the_budget_is_kept_however_long_the_flight():
-    store = KeyframeStore(100)
+    store = KeyframeStore(100, MarkerMap())
     for k in range(5000):
         store.add(frame(k, flight(k / 30)))
         assert len(store.frames) <= 100
@@ -22,7 +23,7 @@ def test_the_budget_is_kept_however_long_the_flight():
 
 
 def test_rare_views_outlive_common_ones():
-    store = KeyframeStore(50)
+    store = KeyframeStore(50, MarkerMap())
     rare = transform(np.eye(3), [10.0, 0.0, 0.0])
     store.add(frame(0, rare))
     for k in range(1, 2000):
@@ -36,7 +37,7 @@ def test_frames_on_all_sides_of_the_origin_are_thinned_as_soon_as_others():
     turns, places = so3_exp(rng.normal(size=(300, 3))), rng.uniform(-4.0, 4.0, (300, 3))
 
     def seconds(origin):
-        store, begun = KeyframeStore(10), time.perf_counter()
+        store, begun = KeyframeStore(10, MarkerMap()), time.perf_counter()
         for k in range(300):
             store.add(frame(k, transform(turns[k], places[k] + origin)))
         return time.perf_counter() - begun
@@ -47,7 +48,7 @@ def test_frames_on_all_sides_of_the_origin_are_thinned_as_soon_as_others():
 
 
 def test_bridges_are_never_dropped():
-    store = KeyframeStore(20)
+    store = KeyframeStore(20, MarkerMap())
     store.bridges.add(3)
     for k in range(500):
         store.add(frame(k, np.eye(4)))
@@ -56,7 +57,7 @@ def test_bridges_are_never_dropped():
 
 def test_frames_that_were_not_adjusted_move_with_the_nearest():
     """After a loop is closed, its beginning and its end move differently."""
-    store = KeyframeStore(10)
+    store = KeyframeStore(10, MarkerMap())
     for k in range(6):
         store.add(frame(k, transform(np.eye(3), [k, 0.0, 0.0])))
     early, late = transform(np.eye(3), [0.0, 0.1, 0.0]), transform(so3_exp([0.0, 0.0, 0.1]), [0.5, 0.0, 0.0])
@@ -72,7 +73,7 @@ def test_frames_that_were_not_adjusted_move_with_the_nearest():
 def test_rotations_stay_rotations_however_often_the_map_moves():
     """Rounding errors must not double from one adjustment to the next: in half an hour there are hundreds."""
     rng = np.random.default_rng(0)
-    store = KeyframeStore(10)
+    store = KeyframeStore(10, MarkerMap())
     for k in range(6):
         store.add(frame(k, transform(so3_exp(rng.normal(size=3)), rng.normal(size=3))))
     for _ in range(300):
