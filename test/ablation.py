@@ -193,7 +193,7 @@ MECHANISMS = {
     'ends of motion blur': Mechanism(
         'fast, 8 K, guided',
         ('frame:_moments', 'frame:_halves'),
-        {'refining:WITHOUT_TAIL': [(0.0, 1.0)]},
+        {'refining:WITHOUT_TAIL': _place('corners.sides:ONE_GAUSSIAN')},
     ),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(

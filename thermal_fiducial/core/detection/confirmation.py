@@ -21,7 +21,7 @@ from thermal_fiducial.core.detection.corner_errors import (
     OF_LOCAL_PX,
 )
 from thermal_fiducial.core.detection.corners.segments import measure, REACHED, Segments, UNMEASURED
-from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind_border, model, sides_of
+from thermal_fiducial.core.detection.corners.sides import blur_of, edges_behind_border, model, sides_of
 from thermal_fiducial.core.detection.frame import counts_of, Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
@@ -109,11 +109,11 @@ class DisplayedSides:
         a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
         inner = np.moveaxis(se3.seen_between(seen.x, se3.bilinear(a, b)), 0, -1)
         sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _WIDEST_PX)
-        blur, *_ = blurs(sides, blur_px, refined.blur.spread)
+        blur = blur_of(sides, blur_px, refined.blur.spread)
         value, slope, counting = model(sides, self._behind[refined.ids], blur)
         counting &= self._white[refined.ids].reshape(-1, self._bits)
         counts = counts_of(sides.pixel, frame.image, refined.blur.to_tails)
-        return measure(counts, (value, slope, counting), REACHED * blur.across)
+        return measure(counts, (value, slope, counting), REACHED * blur.width)
 
 
 def _outward(corners: FloatArray) -> FloatArray:

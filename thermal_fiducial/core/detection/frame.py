@@ -50,11 +50,11 @@ def _moments(youngest: float, oldest: float) -> tuple[float, float]:
     return youngest + 1.0 - span * left / (1.0 - left), math.sqrt(1.0 - span**2 * left / (1.0 - left) ** 2)
 
 
-def _halves() -> list[tuple[float, float]]:
-    """The response younger than the lag tail as two Gaussians, of its younger and of its older half."""
+def _halves() -> FloatArray:
+    """The response younger than the lag tail as two Gaussians (2, 2), of its younger and of its older half."""
     median = -math.log(0.5 * (1.0 + _FORGOTTEN))
     halves = _moments(0.0, median), _moments(median, _TAIL)
-    return [((mean - REMAINING) / SPREAD, spread / SPREAD) for mean, spread in halves]
+    return (np.array(halves) - [REMAINING, 0.0]) / SPREAD
 
 
 #: Motion blur that remains, as shares of that by the whole lag: its mean displacement, and its standard deviation.

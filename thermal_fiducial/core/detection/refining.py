@@ -28,7 +28,7 @@ from thermal_fiducial.core.detection.corners.segments import (
     UNMEASURED,
     with_gradients,
 )
-from thermal_fiducial.core.detection.corners.sides import Blur, blurs, model, NARROW, Sides, sides_of
+from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, NARROW, ONE_GAUSSIAN, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.frame import (
     counts_of,
@@ -251,15 +251,15 @@ def refine_corners(
     motion = motion or MotionBlur.none(len(corners.px))
     uneven = np.zeros(len(corners.px), dtype=bool) if uneven is None else uneven
     # Where lag tails stay, the blur is so small that it hardly differs from one Gaussian.
-    halves = [] if motion.to_tails is None else WITHOUT_TAIL
+    parts = ONE_GAUSSIAN if motion.to_tails is None else WITHOUT_TAIL
     widest = math.hypot(blur_px, math.sqrt(float((motion.spread * motion.spread).sum(axis=1).max())))
     sides = sides_of(corners.x, camera, image.shape, behind.shape[2], columns, widest)
-    blur, *parts = blurs(sides, blur_px, motion.spread, halves)
+    blur = blur_of(sides, blur_px, motion.spread, parts)
     counts = counts_of(sides.pixel, image, motion.to_tails)
-    modelled = model(sides, behind, blur, narrow, parts)
+    modelled = model(sides, behind, blur, narrow)
     if uneven.any():
         modelled[2][:] &= _near(sides, blur, uneven)
-    segments, shows = with_gradients(measure(counts, modelled, REACHED * blur.across), sides, widest)
+    segments, shows = with_gradients(measure(counts, modelled, REACHED * blur.width), sides, widest)
     refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)))
     if shows.any():
         moving, uneven = _again(moving, shows, uneven)
@@ -285,7 +285,7 @@ def _again(moving: IntArray, shows: BoolArray, uneven: BoolArray) -> tuple[IntAr
 
 def _near(sides: Sides, blur: Blur, uneven: BoolArray) -> BoolArray:
     """Which pixels (M, C, E, m) count: all, or those near the sides where markers (N,) are ``uneven``."""
-    farthest = np.repeat(np.where(uneven, _WITH_GRADIENT, np.inf), 4)[:, None] * blur.across
+    farthest = np.repeat(np.where(uneven, _WITH_GRADIENT, np.inf), 4)[:, None] * blur.width
     return np.asarray(np.abs(sides.distance) <= farthest.astype(np.float32))
 
 

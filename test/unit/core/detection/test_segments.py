@@ -7,7 +7,7 @@ import pytest
 from support.close_views import BITS, BLUR_WITH_PIXEL, CAMERAS, draw, plate, pose
 
 from thermal_fiducial.core.detection.corners.segments import adjust, measure, median_of, robust_fit, UNMEASURED
-from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind, model, sides_of
+from thermal_fiducial.core.detection.corners.sides import blur_of, edges_behind, model, sides_of
 from thermal_fiducial.core.detection.frame import counts_of
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import marker_corners
@@ -37,10 +37,10 @@ class Measured:
             image[self.outlier[1], self.outlier[0]] += 5000.0
         x = CAMERA.normalise(CORNERS[None] + np.array(self.off))
         self.sides = sides_of(x, CAMERA, IMAGE.shape, CELLS, 6, BLUR_WITH_PIXEL)
-        blur, *_ = blurs(self.sides, BLUR_WITH_PIXEL, np.zeros((1, 2)))
+        blur = blur_of(self.sides, BLUR_WITH_PIXEL, np.zeros((1, 2)))
         counts = counts_of(self.sides.pixel, image.astype(np.float32))
         modelled = model(self.sides, BEHIND[[ID]], blur)
-        self.segments = measure(counts, modelled, np.full_like(blur.across, REACH))
+        self.segments = measure(counts, modelled, np.full_like(blur.width, REACH))
 
 
 @pytest.mark.parametrize('off', [(0.0, 0.0), (0.4, -0.3), (-0.6, 0.5)])

@@ -19,7 +19,7 @@ from thermal_fiducial.core.detection.corners.segments import (
     robust_fit,
     UNMEASURED,
 )
-from thermal_fiducial.core.detection.corners.sides import Blur, blurred_step, blurs, columns_across, NODES, Sides
+from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, blurred_step, columns_across, NODES, Sides
 from thermal_fiducial.core.detection.frame import counts_of, Frame, LEAST_DEPTH, Places, rolling_displacement
 from thermal_fiducial.core.detection.plates import outlines_on_faces
 from thermal_fiducial.core.geometry import se3
@@ -118,9 +118,9 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer, thick
     onward = layer.project(se3.apply(T, on_marker(middle + pattern.onward, size))) - nodes[:, 2]
     widest = math.hypot(layer.blur, float(np.linalg.norm(layer.lag_blur)))
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, _COLUMNS, widest)
-    blur, *_ = blurs(sides, layer.blur, layer.lag_blur[None])
+    blur = blur_of(sides, layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
-    measured = measure(counts_of(sides.pixel, layer.image), modelled, REACHED * blur.across, len(nodes))
+    measured = measure(counts_of(sides.pixel, layer.image), modelled, REACHED * blur.width, len(nodes))
     used = measured.variance[0] < UNMEASURED
     if used.sum() < 6:
         return None
@@ -152,11 +152,11 @@ def _outlines(T: FloatArray, size: float, pattern: GridEdges, thickness: float) 
 
 def _model(sides: Sides, step: FloatArray, blur: Blur) -> tuple[Float32Array, Float32Array, BoolArray]:
     """White's share of every pixel but for a constant, its derivative by distance, whether it counts, (M, C, E, 1)."""
-    sharpness, height = (1.0 / blur.across).astype(np.float32), step[:, None].astype(np.float32)
+    sharpness, height = (1.0 / blur.width).astype(np.float32), step[:, None].astype(np.float32)
     value, slope = blurred_step(sides.distance, sharpness, height)
-    ends = _QUIET * blur.along / sides.along
+    ends = _QUIET * blur.along[0] / sides.along
     straight = sides.fresh & (sides.t > ends) & (sides.t < 1.0 - ends)
-    counting: BoolArray = np.asarray((np.abs(sides.distance) <= sides.across - _QUIET * blur.across) & straight)
+    counting: BoolArray = np.asarray((np.abs(sides.distance) <= sides.across - _QUIET * blur.width) & straight)
     if sides.inside is not None:
         counting &= sides.inside
     return value, slope, counting

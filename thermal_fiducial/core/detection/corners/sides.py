@@ -5,7 +5,6 @@ whole pixels, or by rows if these cross it at a larger angle. Pixels are not int
 The model of a column is a blurred step from white to black, plus the nearest parallel edges inside the marker.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 import math
@@ -38,17 +37,21 @@ _CUBIC = 0.04417 * _LINEAR
 _PLATE_EDGE_SHOWS = 1.5
 # Least share of the side's step in a column: it falls off at the ends of the side.
 _MOSTLY = 0.7
+#: Mean and standard deviation (1, 2) of blur that is one Gaussian, in that blur.
+ONE_GAUSSIAN = np.array([[0.0, 1.0]])
 
 
 class Blur(NamedTuple):
-    """Gaussian blur of sides [px], (E, m) each."""
+    """Blur of sides by P Gaussians of equal weight [px]."""
 
-    #: standard deviations across and along the sides
+    #: (P, E, m) and (P, E, 1) standard deviations across and along the sides
     across: FloatArray
     along: FloatArray
-    #: displacement inward, and along the sides from their starts to their ends
+    #: (P, E, m) displacement inward, and (P, E, 1) along the sides from their starts to their ends
     inward: FloatArray
     onward: FloatArray
+    #: (E, m) standard deviation of all together across the sides
+    width: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,23 +209,27 @@ def _changes(inward: Float32Array) -> Float32Array:
     return np.ascontiguousarray(np.moveaxis(np.diff(inward, axis=2), 2, 3))
 
 
-def blurs(sides: Sides, optics: float, motion: FloatArray, parts: Sequence[tuple[float, float]] = ()) -> list[Blur]:
-    """Blur of the sides of N markers by optics [px] and a motion (N, 2) [px], and the Gaussians that make it up.
+def blur_of(sides: Sides, optics: float, motion: FloatArray, parts: FloatArray = ONE_GAUSSIAN) -> Blur:
+    """Blur of the sides of N markers by optics [px] and a motion (N, 2) [px].
 
-    ``parts``: mean and standard deviation of each of these by motion, in that motion.
+    ``parts`` (P, 2): mean and standard deviation of the Gaussians that make up the blur by motion, in that motion.
     """
     span = sides.ends[:, 1] - sides.ends[:, 0]
     by_side = np.repeat(motion, len(span) // len(motion), axis=0)
     across = (sides.normal @ by_side[..., None])[..., 0]
     along = (span * by_side).sum(axis=1, keepdims=True) / sides.along
-    return [
-        Blur(np.hypot(optics, spread * across), np.hypot(optics, spread * along), mean * across, mean * along)
-        for mean, spread in ((0.0, 1.0), *parts)
-    ]
+    mean, spread = parts.T[..., None, None]
+    return Blur(
+        np.hypot(optics, spread * across),
+        np.hypot(optics, spread * along),
+        mean * across,
+        mean * along,
+        np.hypot(optics, across),
+    )
 
 
 def model(
-    sides: Sides, behind: Float32Array, blur: Blur, narrow: float = NARROW, parts: Sequence[Blur] = ()
+    sides: Sides, behind: Float32Array, blur: Blur, narrow: float = NARROW
 ) -> tuple[Float32Array, Float32Array, BoolArray]:
     """Share of white in every pixel, up to a constant, its derivative by distance, and whether the pixel counts.
 
@@ -231,7 +238,6 @@ def model(
     behind : (N, 4, m, 2) of :func:`edges_behind`
     blur : of the sides
     narrow : width of cells below which the model contains parallel edges, in blurs
-    parts : of equal weight that make up ``blur`` where it is not Gaussian
 
     Returns
     -------
@@ -239,14 +245,12 @@ def model(
     """
     cells = behind.shape[2]
     cell = sides.across / cells
-    overlapping = cell < narrow * blur.across
+    overlapping = cell < narrow * blur.width
     edges, which = behind.reshape(-1, cells, len(NEIGHBOURS)), np.flatnonzero(overlapping.any(axis=1))
-    modelled = [_blurred_sides(sides, edges, which, part) for part in parts or (blur,)]
-    value, slope, own = modelled[0]
-    if parts:
-        value, slope, own = (sum(terms[1:], terms[0]) / len(terms) for terms in zip(*modelled, strict=True))
-    reach = np.where(overlapping, cell, cell - 2.0 * blur.across)
-    quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur.across, 0.0))
+    modelled = _blurred_sides(sides, edges, which, blur)
+    value, slope, own = (each[0] if len(each) == 1 else each.mean(axis=0) for each in modelled)
+    reach = np.where(overlapping, cell, cell - 2.0 * blur.width)
+    quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur.width, 0.0))
     counting: BoolArray = np.asarray(sides.distance >= -quiet.astype(np.float32))
     counting &= sides.distance <= reach.astype(np.float32)
     counting &= sides.fresh & (own > _MOSTLY)
@@ -258,31 +262,34 @@ def model(
 def _blurred_sides(
     sides: Sides, behind: Float32Array, overlapping: IntArray, blur: Blur
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Value and derivative of every pixel (M, C, E, m), and the share (C, E, m) of the side's step in every column.
+    """By each Gaussian: value and derivative of every pixel, (P, M, C, E, m), and the step's share in every column.
 
     Parameters
     ----------
     behind : (E, m, 2) change of value across the edges behind the sides
     overlapping : indices of the sides whose parallel edges are in the model
     """
-    distance, sharpness = sides.distance - blur.inward.astype(np.float32), (1.0 / blur.across).astype(np.float32)
-    t = (sides.t - blur.onward / sides.along).astype(np.float32)
-    # Blurred along the side, the share is less than 1 near the ends.
-    z = np.array([t, 1.0 - t]) * (sides.along / blur.along).astype(np.float32)
+    distance = sides.distance - blur.inward.astype(np.float32)[:, None, None]
+    sharpness = (1.0 / blur.across).astype(np.float32)[:, None]
+    t = (sides.t - (blur.onward / sides.along)[:, None]).astype(np.float32)
+    ends = (sides.along / blur.along).astype(np.float32)[:, None]
+    # Blurred along the side, the share (P, C, E, m) is less than 1 near the ends.
+    z = np.array([t, 1.0 - t]) * ends
     own = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0)
-    value, slope = blurred_step(distance, sharpness, -own)
+    value, slope = blurred_step(distance, sharpness[:, None], -own[:, None])
     if len(overlapping):
-        amounts = _of_cells(t[:, overlapping], (sides.along / blur.along)[overlapping]) @ behind[overlapping]
+        distance, sharpness = distance[..., overlapping, :], sharpness[:, None, :, overlapping]
+        amounts = _of_cells(t[:, :, overlapping], ends[:, :, overlapping]) @ behind[overlapping]
         for index, number in enumerate(NEIGHBOURS):
             away = (number * sides.across[overlapping] / behind.shape[1]).astype(np.float32)
-            step, rise = blurred_step(distance[:, :, overlapping] - away, sharpness[overlapping], amounts[..., index])
-            value[:, :, overlapping] += step
-            slope[:, :, overlapping] += rise
+            step, rise = blurred_step(distance - away, sharpness, amounts[:, None, ..., index])
+            value[..., overlapping, :] += step
+            slope[..., overlapping, :] += rise
     return value, slope, own
 
 
-def _of_cells(t: Float32Array, sharpness: FloatArray) -> Float32Array:
-    """Shares (C, E, m, m) of the m cells along a side in columns at ``t`` (C, E, m), blurred along the side."""
+def _of_cells(t: Float32Array, sharpness: Float32Array) -> Float32Array:
+    """Shares (..., m, m) of the m cells along a side in columns at ``t`` (..., m), blurred along the side."""
     z = (t[..., None] - np.linspace(0.0, 1.0, t.shape[-1] + 1)) * sharpness[..., None]
     return np.asarray(-np.diff(0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR))), dtype=np.float32)
 
