@@ -239,7 +239,7 @@ def _pose_covariance(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> Floa
         blocks = blocks + of_motion_blur(frame.lag * places.flow, twist_covariance, lag_blur)[0]
     gain = np.linalg.pinv(J).reshape(6, 4, 2)
     systematic = np.einsum('ick,ckl,jcl->ij', gain, blocks, gain)
-    return np.asarray(np.linalg.inv(fit.information) + systematic)
+    return np.asarray(fit.covariance + systematic)
 
 
 def _independent(J: FloatArray, information: FloatArray) -> FloatArray:

@@ -92,8 +92,8 @@ class PoseFit(NamedTuple):
 
     #: (4, 4)
     T_camera_marker: FloatArray
-    #: (6, 6) information on translation and rotation in the camera frame, of the edges alone
-    information: FloatArray
+    #: (6, 6) of translation and rotation in the camera frame, by the edges alone
+    covariance: FloatArray
     #: longest move of an edge in this step [px], along its normal
     moved_px: float
     #: numbers of edges in view, and of those with a step of the common contrast that agree with the pose
@@ -129,10 +129,10 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer, thick
     # So weak that it only keeps the system solvable.
     prior = TINY * np.diag((J[used] ** 2).sum(axis=0))
     fit = robust_fit((J * sharpness[:, None])[None], measured.shift * sharpness, used[None], prior)
-    step = fit.moved[0]
+    step = fit.moved[0, :, 0]
     return PoseFit(
         se3.transform(se3.so3_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3]),
-        (fit.information[0] - prior) * fit.trust[0],
+        fit.covariance[0],
         float(np.abs(J[used] @ step).max()),
         len(used),
         int(fit.kept.sum()),

@@ -72,20 +72,19 @@ class Segments(NamedTuple):
         contrast, sizes = self.contrast.reshape(used.shape), []
         for apart in (1, 2):
             change = np.abs(contrast[..., apart:] - contrast[..., :-apart]).reshape(len(used), -1)
-            both = used[..., apart:] & used[..., :-apart]
-            sizes.append(SIGMA_OF_MEDIAN * median_of(change, both.reshape(len(used), -1))[:, 0])
-        return np.asarray(np.sqrt(np.maximum(sizes[1] ** 2 - sizes[0] ** 2, 0.0) / 3.0))
+            both = (used[..., apart:] & used[..., :-apart]).reshape(change.shape)
+            sizes.append(median_of(change, both)[:, 0])
+        squared = np.maximum(sizes[1] * sizes[1] - sizes[0] * sizes[0], 0.0)
+        return np.asarray(SIGMA_OF_MEDIAN / math.sqrt(3.0) * np.sqrt(squared))
 
 
 class RobustFit(NamedTuple):
     """N fits of P unknowns to S shifts."""
 
-    #: (N, P)
+    #: (N, P, 1)
     moved: FloatArray
-    #: (N, P, P) information on it, prior included, for the given standard deviations of the shifts
-    information: FloatArray
-    #: (N,) factor on the information by the scatter of the shifts
-    trust: FloatArray
+    #: (N, P, P) for the given standard deviations of the shifts, prior included, and their scatter
+    covariance: FloatArray
     #: (N, S) inliers
     kept: BoolArray
 
@@ -130,35 +129,27 @@ def measure(
     np.subtract(counts, counts[counts.shape[0] // 2, counts.shape[1] // 2], out=X[3])
     X[3] *= X[0]
     X = X.reshape(_PLANES, counts.shape[0] * counts.shape[1], -1)
-    moments = _moments(X)
-    fit = _fit(moments, segments)
+    fit = _fit(X, segments)
     lines = np.array([fit.level, fit.contrast, fit.product, _PIXEL_OUTLIER * np.sqrt(fit.noise)], dtype=np.float32)
     level, contrast, product, limit = lines.reshape(4, -1)
     inliers = np.abs(X[3] - level * X[0] - contrast * X[1] - product * X[2]) <= limit
-    touched = np.flatnonzero(~inliers.all(axis=0))
-    if len(touched):
-        X = X[..., touched]
-        X[:4] *= inliers[:, touched]
-        moments[:, touched] = _moments(X)
-        fit = _fit(moments, segments)
+    if not inliers.all():
+        X[:4] *= inliers
+        fit = _fit(X, segments)
     return _judged(fit, reach.reshape(fit.noise.shape))
 
 
-def _moments(X: Float32Array) -> Float32Array:
-    """Sums (10, segments) over pixels (10, pixels, segments): of the first four, and of their products but the first's.
+def _fit(X: Float32Array, segments: int) -> _SegmentFit:
+    """Least squares of the counts on (1, model, derivative), by marker (N, S).
 
-    The first four are 1, model, derivative and counts, zero for pixels that do not count; the others are room.
+    ``X`` (10, pixels, N S): 1, model, derivative and counts, zero for pixels that do not count, and room for products.
     """
     np.multiply(X[1], X[1:4], out=X[4:7])
     np.multiply(X[2], X[2:4], out=X[7:9])
     np.multiply(X[3], X[3], out=X[9])
     # A product of matrices adds up three times as fast as a sum.
-    return np.asarray(np.ones(X.shape[1], dtype=np.float32) @ X)
-
-
-def _fit(moments: Float32Array, segments: int) -> _SegmentFit:
-    """Least squares of the counts on (1, model, derivative), by marker (N, S), with :func:`_moments` (10, N S)."""
-    sums = moments.astype(np.float64).reshape(len(moments), -1, segments)
+    moments = np.ones(X.shape[1], dtype=np.float32) @ X
+    sums = moments.astype(np.float64).reshape(len(X), -1, segments)
     number = sums[0]
     means = sums[:4] / np.maximum(number, 1.0)
     # Without their means the columns leave two unknowns.
@@ -226,6 +217,9 @@ def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> tuple[Se
 
 def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
     """Medians (N, 1) of the good ones of values (N, S), 0 where there is none."""
+    if good.all():
+        middle = (values.shape[1] - 1) // 2
+        return np.partition(values, middle, axis=1)[:, middle, None]
     number = good.sum(axis=1)
     order = np.where(good, values, np.inf)
     order.sort(axis=1)
@@ -243,7 +237,7 @@ def adjust(sides: Sides, segments: Segments) -> tuple[FloatArray, FloatArray]:
     A = (share[..., None] * sides.normal.reshape(-1, 4, cells, 1, 2)).reshape(-1, 4 * cells, 8)
     sharpness = 1.0 / np.sqrt(segments.variance)
     fit = robust_fit(A * sharpness[..., None], segments.shift * sharpness, used, _PRIOR)
-    return fit.moved[..., None], np.linalg.inv(fit.information) / fit.trust[:, None, None] + OF_SIDES_PX**2 * _EYE
+    return fit.moved, fit.covariance + OF_SIDES_PX**2 * _EYE
 
 
 def robust_fit(A: FloatArray, shift: FloatArray, used: BoolArray, prior: FloatArray) -> RobustFit:
@@ -257,8 +251,8 @@ def robust_fit(A: FloatArray, shift: FloatArray, used: BoolArray, prior: FloatAr
     weighted = turned = A.swapaxes(1, 2)
     robust = np.ones_like(shift)
     for _ in range(_ROUNDS):
-        information = weighted @ A + prior
-        moved = np.linalg.solve(information, weighted @ shift[..., None])
+        covariance = np.linalg.inv(weighted @ A + prior)
+        moved = covariance @ (weighted @ shift[..., None])
         left = np.abs(shift - (A @ moved)[..., 0])
         former = robust
         scale = np.maximum(SIGMA_OF_MEDIAN * median_of(left, used), 1.0)
@@ -269,5 +263,5 @@ def robust_fit(A: FloatArray, shift: FloatArray, used: BoolArray, prior: FloatAr
     kept = used & (robust == 1.0)
     chi2 = (left * left * kept).sum(axis=1) / _KEPT_VARIANCE
     free = np.maximum(kept.sum(axis=1) - A.shape[2], 0.0)
-    trust = (free + _SCATTER_COUNTS) / (chi2 + _SCATTER_COUNTS)
-    return RobustFit(np.asarray(moved[..., 0]), np.asarray(information), np.asarray(trust), kept)
+    scatter = (chi2 + _SCATTER_COUNTS) / (free + _SCATTER_COUNTS)
+    return RobustFit(np.asarray(moved), np.asarray(covariance * scatter[:, None, None]), kept)
