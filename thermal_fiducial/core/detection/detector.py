@@ -123,8 +123,7 @@ class MarkerDetector:
         """The rows of whole markers, and those of known ones that are partially visible."""
         seen = rows['id'].astype(np.int64)
         candidates = self._known.partially_visible(T_camera_map, frame.camera, seen)
-        allowed = self._finder.allowed(self._known, self.config)
-        ids, corners = self._partial.look(frame, candidates, position_std_m, allowed, self.config)
+        ids, corners = self._partial.look(frame, candidates, position_std_m, self.config)
         if len(ids) == 0:
             return rows
         at = ImagePoints.at(corners.corners_px, frame.camera)

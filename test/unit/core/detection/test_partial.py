@@ -49,7 +49,7 @@ def look(image, camera, T_expected, noise, marker_id=ID, config=CONFIG):
     known = KnownMarkers({marker_id: (T_expected, SIZE)}, np.ones(len(BITS)))
     cut = known.partially_visible(np.eye(4), camera, np.zeros(0, dtype=np.int64))
     assert len(cut.ids) == 1
-    return SEARCH.look(frame, cut, 0.01, np.ones(len(BITS), dtype=bool), config)
+    return SEARCH.look(frame, cut, 0.01, config)
 
 
 def disturbed(T, rng, scale=0.005):
