@@ -6,7 +6,7 @@ reverses over a board do not matter.
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -43,7 +43,6 @@ class BoardPoints:
     points : (N,) their index on the board
     pixels : (N, 2) where they are, to a pixel or a tenth of their spacing
     beyond_nodes, beyond_pixels : (B, 2) grid points outside the board
-    larger_nodes, larger_pixels : (L, 2) a grid that covers more of the board but extends beyond it
     look : search index of the keypoints, see :class:`Keypoints`
     """
 
@@ -51,35 +50,53 @@ class BoardPoints:
     pixels: FloatArray
     beyond_nodes: IntArray
     beyond_pixels: FloatArray
-    larger_nodes: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
-    larger_pixels: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     look: int = 0
 
 
-def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | GridRefusal:
-    """Most complete sighting of a board among several sets of keypoints, or why there is none."""
+@dataclass(frozen=True)
+class LargerGrid:
+    """A grid that covers a board and extends beyond it: another board, or this one with clutter beside it.
+
+    Parameters
+    ----------
+    nodes, pixels : (L, 2)
+    covered : number of board points in it
+    look : see :class:`BoardPoints`
+    """
+
+    nodes: IntArray
+    pixels: FloatArray
+    covered: int
+    look: int
+
+
+def find_board(views: Iterable[Keypoints], board: BoardNodes) -> tuple[BoardPoints | GridRefusal, LargerGrid | None]:
+    """Most complete sighting of a board among several sets of keypoints, or why there is none.
+
+    Also the larger grid that covers most of the board, if it covers more than the sighting.
+    """
     best: BoardPoints | None = None
     refusal, weightiest = GridRefusal('no regular grid of points'), 0.0
-    larger, larger_pixels, covered = np.zeros((0, 2), np.int64), np.zeros((0, 2)), 0
+    larger: LargerGrid | None = None
     for keypoints, grid in ((points, grid) for points in views for grid in Grower(points).grids()):
-        nodes = np.array(list(grid), dtype=np.int64)
         pixels = keypoints.pixels[list(grid.values())]
-        placed = board.place(_facing(nodes, pixels))
+        nodes = _facing(np.array(list(grid), dtype=np.int64), pixels)
+        placed = board.place(nodes)
         if isinstance(placed, GridRefusal):
             # Among many points that belong to no board a large grid may be chance: its share of them counts too.
             weight = len(grid) ** 2 / len(keypoints.pixels)
             if weight > weightiest:
                 refusal, weightiest = placed, weight
-            if placed.covered > covered:
-                larger, larger_pixels, covered = nodes, pixels, placed.covered
+            if placed.covered > (0 if larger is None else larger.covered):
+                larger = LargerGrid(nodes, pixels, placed.covered, keypoints.look)
         elif best is None or len(placed.points) > len(best.points):
             beyond = placed.beyond_nodes, pixels[placed.beyond]
             best = BoardPoints(placed.points, pixels[placed.rows], *beyond, look=keypoints.look)
             if len(best.points) == len(board.nodes):
                 break
-    if best is not None and covered > len(best.points):
-        return replace(best, larger_nodes=larger, larger_pixels=larger_pixels)
-    return best or refusal
+    if best is not None and larger is not None and larger.covered <= len(best.points):
+        larger = None
+    return best or refusal, larger
 
 
 def _facing(nodes: IntArray, pixels: FloatArray) -> IntArray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from thermal_fiducial.calibration.appearance import Appearance, Disc, SquaresMeet
 from thermal_fiducial.calibration.keypoints import blobs, Keypoints, saddles, without_speckles
-from thermal_fiducial.calibration.lattice import find_board
+from thermal_fiducial.calibration.lattice import find_board, LargerGrid
 from thermal_fiducial.calibration.placement import BoardNodes, goes_on, GridRefusal
 from thermal_fiducial.calibration.subpixel import refine
 from thermal_fiducial.core.geometry.camera import Camera
@@ -177,9 +177,13 @@ def _sighting(
 
     With at least ``another`` similar points beyond it, it is another board.
     """
-    found = find_board(keypoints, board)
+    found, larger = find_board(keypoints, board)
     if isinstance(found, GridRefusal):
-        raise BoardNotFound(found.reason)
+        of_larger = np.zeros((0, 2)) if larger is None else _refined(image, larger, appearance)
+        good = np.isfinite(of_larger[:, 0])
+        if larger is None or np.sum(good) < _ALIKE * len(good):
+            raise BoardNotFound(found.reason)
+        return _within(larger.nodes[good], of_larger[good], board, points, another), larger.look
     # Points beyond the board are refined too, which rejects clutter but not the points of another board.
     count, beside = len(found.points), len(found.beyond_nodes)
     beside = beside if beside >= another else 0
@@ -190,9 +194,8 @@ def _sighting(
     )
     good = np.isfinite(pixels[:, 0])
     # The same for a larger grid of another scale that extends beyond the board.
-    larger = found.larger_nodes.astype(np.float64)
-    of_larger = refine(image, larger, found.larger_pixels, larger, appearance) if len(larger) else found.larger_pixels
-    beyond = max(int(np.sum(good[count:])), int(np.sum(np.isfinite(of_larger[:, 0]))) - len(points))
+    alike = 0 if larger is None else int(np.sum(np.isfinite(_refined(image, larger, appearance)[:, 0])))
+    beyond = max(int(np.sum(good[count:])), alike - len(points))
     if beyond >= another:
         raise BoardNotFound(goes_on(beyond))
     kept = found.points[good[:count]]
@@ -203,6 +206,22 @@ def _sighting(
     if isinstance(placed, GridRefusal):
         raise BoardNotFound(placed.reason)
     return Sighting(points[kept], pixels[:count][good[:count]]), found.look
+
+
+def _refined(image: Float32Array, larger: LargerGrid, appearance: Appearance) -> FloatArray:
+    """Points (L, 2) of a larger grid, NaN where nothing looks like a point of the board."""
+    nodes = larger.nodes.astype(np.float64)
+    return refine(image, nodes, larger.pixels, nodes, appearance)
+
+
+def _within(nodes: IntArray, pixels: FloatArray, board: BoardNodes, points: FloatArray, another: int) -> Sighting:
+    """The board among points (L, 2) that look like its own, after clutter beside it was rejected."""
+    placed = board.place(nodes)
+    if isinstance(placed, GridRefusal):
+        raise BoardNotFound(placed.reason)
+    if len(placed.beyond) >= another:
+        raise BoardNotFound(goes_on(len(placed.beyond)))
+    return Sighting(points[placed.points], pixels[placed.rows])
 
 
 class MarkerBoard:
