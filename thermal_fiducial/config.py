@@ -199,112 +199,6 @@ def _number(name: str, value: Any) -> float:
     return float(value)
 
 
-# --- parameters that several nodes share --------------------------------------------------------------
-
-
-def _dictionary() -> Any:
-    text = (
-        'Dictionary of the markers: a name of OpenCV or of this package (STENCIL_4X4_100 is the default of '
-        '"markers make"), or the path of a dictionary file.'
-    )
-    return param('DICT_4X4_50', text, path=True)
-
-
-def _marker_size() -> Any:
-    return param(0.30, 'Side of the black square of a marker.', unit='m', minimum=0.005, maximum=10.0)
-
-
-def _marker_size_overrides() -> Any:
-    text = 'Sides of single markers, strings "ID:SIZE", e.g. ["7:0.50"].'
-    return param((), text, unit='m', verify=size_overrides)
-
-
-def _map_file() -> Any:
-    return param('', 'Marker map (YAML). Empty: no map.', path=True)
-
-
-def _calibration_file() -> Any:
-    return param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.', path=True)
-
-
-def _mode() -> Any:
-    return param(
-        'mapping',
-        'mapping: new markers enter the map; localization: the map never changes.',
-        choices=('mapping', 'localization'),
-    )
-
-
-def _camera_position(camera: str = 'the camera', needs: tuple[str, ...] = ()) -> Any:
-    return param(
-        (0.0, 0.0, 0.0),
-        f'Position of {camera} in base_link (the IMU frame).',
-        unit='m',
-        length=3,
-        minimum=-10.0,
-        maximum=10.0,
-        needs=needs,
-    )
-
-
-def _camera_orientation(frame: str = 'thermal_camera_optical', needs: tuple[str, ...] = ()) -> Any:
-    return param(
-        (-0.5, 0.5, -0.5, 0.5),
-        f'Orientation of {frame} in base_link, quaternion x y z w. Default: looks forward.',
-        length=4,
-        normed=True,
-        needs=needs,
-    )
-
-
-def _base_frame() -> Any:
-    return param('base_link', 'Frame of the robot; identical to the IMU frame unless TF or a URDF says otherwise.')
-
-
-def _camera_frame() -> Any:
-    return param('thermal_camera_optical', 'Optical frame of the camera in TF and URDF.')
-
-
-def _extrinsics() -> Any:
-    return param(
-        'auto',
-        'Source of camera_position and camera_orientation. auto: /tf_static (needs tf2_msgs) or robot_description, if '
-        'they connect camera_frame with the robot, else the parameters; parameters: always the parameters.',
-        choices=('auto', 'parameters'),
-    )
-
-
-def _prefix_frames() -> Any:
-    return param(False, "Prefix the robot's frames, but not the map frame, with the node's namespace.")
-
-
-def _camera_time_offset() -> Any:
-    return param(0.0, 'Clock offset of the camera, t_imu = t_camera + offset.', unit='s', minimum=-1.0, maximum=1.0)
-
-
-def _time_offset_std() -> Any:
-    return param(
-        0.03,
-        'Standard deviation of camera_time_offset: prior if it is estimated, else noise of each pose.',
-        unit='s',
-        minimum=0.0,
-        maximum=0.2,
-    )
-
-
-def _image_rate() -> Any:
-    text = 'Expected image rate for the diagnostics; 0: the rate of the first seconds.'
-    return param(0.0, text, unit='Hz', minimum=0.0, maximum=1000.0)
-
-
-def _realtime_priority() -> Any:
-    text = (
-        'SCHED_RR priority of tau2_camera, if the user may set one (rtprio in limits.conf); detector, mapper and '
-        'filter get 1, 2 and 3 more. 0: ordinary scheduling.'
-    )
-    return param(1, text, minimum=0, maximum=96)
-
-
 def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
     """Marker ID to side [m] from strings "ID:SIZE".
 
@@ -336,14 +230,137 @@ def unknown_markers(config: 'ArucoDetectorConfig', count: int) -> list[str]:
     return lines
 
 
+# --- parameters that several nodes share: bases of their configs, the last of which comes first ---------
+
+
+def _camera_position(camera: str = 'the camera', needs: tuple[str, ...] = ()) -> Any:
+    return param(
+        (0.0, 0.0, 0.0),
+        f'Position of {camera} in base_link (the IMU frame).',
+        unit='m',
+        length=3,
+        minimum=-10.0,
+        maximum=10.0,
+        needs=needs,
+    )
+
+
+def _camera_orientation(frame: str = 'thermal_camera_optical', needs: tuple[str, ...] = ()) -> Any:
+    return param(
+        (-0.5, 0.5, -0.5, 0.5),
+        f'Orientation of {frame} in base_link, quaternion x y z w. Default: looks forward.',
+        length=4,
+        normed=True,
+        needs=needs,
+    )
+
+
+@dataclass(frozen=True)
+class MarkerParameters(SelfChecked):
+    """What the markers are."""
+
+    dictionary: str = param(
+        'DICT_4X4_50',
+        'Dictionary of the markers: a name of OpenCV or of this package (STENCIL_4X4_100 is the default of '
+        '"markers make"), or the path of a dictionary file.',
+        path=True,
+    )
+    marker_size: float = param(0.30, 'Side of the black square of a marker.', unit='m', minimum=0.005, maximum=10.0)
+    marker_size_overrides: tuple[str, ...] = param(
+        (), 'Sides of single markers, strings "ID:SIZE", e.g. ["7:0.50"].', unit='m', verify=size_overrides
+    )
+
+
+@dataclass(frozen=True)
+class FrameParameters(SelfChecked):
+    """How the robot's frames are named."""
+
+    prefix_frames: bool = param(False, "Prefix the robot's frames, but not the map frame, with the node's namespace.")
+
+
+@dataclass(frozen=True)
+class ImageParameters(SelfChecked):
+    """What is published with the images of a camera."""
+
+    calibration_file: str = param(
+        '', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.', path=True
+    )
+    frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
+
+
+@dataclass(frozen=True)
+class MountParameters(SelfChecked):
+    """Where the camera is on the robot."""
+
+    camera_position: tuple[float, ...] = _camera_position()
+    camera_orientation: tuple[float, ...] = _camera_orientation()
+    extrinsics: str = param(
+        'auto',
+        'Source of camera_position and camera_orientation. auto: /tf_static (needs tf2_msgs) or robot_description, if '
+        'they connect camera_frame with the robot, else the parameters; parameters: always the parameters.',
+        choices=('auto', 'parameters'),
+    )
+    base_frame: str = param(
+        'base_link', 'Frame of the robot; identical to the IMU frame unless TF or a URDF says otherwise.'
+    )
+    camera_frame: str = param('thermal_camera_optical', 'Optical frame of the camera in TF and URDF.')
+
+
+@dataclass(frozen=True)
+class ClockParameters(SelfChecked):
+    """The camera's clock against the IMU's."""
+
+    camera_time_offset: float = param(
+        0.0, 'Clock offset of the camera, t_imu = t_camera + offset.', unit='s', minimum=-1.0, maximum=1.0
+    )
+
+
+@dataclass(frozen=True)
+class UncertainClockParameters(ClockParameters):
+    """The same, and how well it is known."""
+
+    time_offset_std: float = param(
+        0.03,
+        'Standard deviation of camera_time_offset: prior if it is estimated, else noise of each pose.',
+        unit='s',
+        minimum=0.0,
+        maximum=0.2,
+    )
+
+
+@dataclass(frozen=True)
+class ScheduleParameters(SelfChecked):
+    """How the operating system schedules a node."""
+
+    realtime_priority: int = param(
+        1,
+        'SCHED_RR priority of tau2_camera, if the user may set one (rtprio in limits.conf); detector, mapper and '
+        'filter get 1, 2 and 3 more. 0: ordinary scheduling.',
+        minimum=0,
+        maximum=96,
+    )
+
+
+@dataclass(frozen=True)
+class ImageRateParameters(ScheduleParameters):
+    """The same of a node that works once a frame."""
+
+    image_rate: float = param(
+        0.0,
+        'Expected image rate for the diagnostics; 0: the rate of the first seconds.',
+        unit='Hz',
+        minimum=0.0,
+        maximum=1000.0,
+    )
+
+
 # --- the four nodes -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Tau2CameraConfig(SelfChecked):
+class Tau2CameraConfig(ImageRateParameters, FrameParameters, ImageParameters):
     """Ingestion of raw thermal frames."""
 
-    calibration_file: str = _calibration_file()
     image_transport: str = param(
         'raw',
         'raw: thermal/image_raw; compressed: thermal/image_raw/compressed, 16-bit PNG of image_transport.',
@@ -387,26 +404,12 @@ class Tau2CameraConfig(SelfChecked):
         minimum=1.0,
         live=True,
     )
-    frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
-    prefix_frames: bool = _prefix_frames()
-    image_rate: float = _image_rate()
-    realtime_priority: int = _realtime_priority()
 
 
 @dataclass(frozen=True)
-class ArucoDetectorConfig(SelfChecked):
+class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters, MountParameters, MarkerParameters):
     """Detection and pose estimation of markers."""
 
-    dictionary: str = _dictionary()
-    marker_size: float = _marker_size()
-    marker_size_overrides: tuple[str, ...] = _marker_size_overrides()
-    camera_position: tuple[float, ...] = _camera_position()
-    camera_orientation: tuple[float, ...] = _camera_orientation()
-    extrinsics: str = _extrinsics()
-    base_frame: str = _base_frame()
-    camera_frame: str = _camera_frame()
-    prefix_frames: bool = _prefix_frames()
-    camera_time_offset: float = _camera_time_offset()
     bolometer_lag: float = param(
         0.010,
         'Thermal time constant of the bolometers; 0: no lag (a cooled detector, say).',
@@ -528,19 +531,20 @@ class ArucoDetectorConfig(SelfChecked):
         choices=('drop', 'best'),
         live=True,
     )
-    image_rate: float = _image_rate()
-    realtime_priority: int = _realtime_priority()
 
 
 @dataclass(frozen=True)
-class MarkerMapperConfig(SelfChecked):
+class MarkerMapperConfig(
+    ImageRateParameters, UncertainClockParameters, FrameParameters, MountParameters, MarkerParameters
+):
     """The incremental marker map."""
 
-    dictionary: str = _dictionary()
-    marker_size: float = _marker_size()
-    marker_size_overrides: tuple[str, ...] = _marker_size_overrides()
-    map_file: str = _map_file()
-    mode: str = _mode()
+    map_file: str = param('', 'Marker map (YAML). Empty: no map.', path=True)
+    mode: str = param(
+        'mapping',
+        'mapping: new markers enter the map; localization: the map never changes.',
+        choices=('mapping', 'localization'),
+    )
     map_frame: str = param('map', 'Frame of the map.')
     second_camera: str = param(
         '',
@@ -558,14 +562,6 @@ class MarkerMapperConfig(SelfChecked):
         path=True,
         needs=('cloud_file',),
     )
-    camera_position: tuple[float, ...] = _camera_position()
-    camera_orientation: tuple[float, ...] = _camera_orientation()
-    extrinsics: str = _extrinsics()
-    base_frame: str = _base_frame()
-    camera_frame: str = _camera_frame()
-    prefix_frames: bool = _prefix_frames()
-    camera_time_offset: float = _camera_time_offset()
-    time_offset_std: float = _time_offset_std()
     marker_size_std: float = param(
         0.003,
         'Scale error common to all marker sizes (relative standard deviation); enters the covariances of map and '
@@ -601,8 +597,6 @@ class MarkerMapperConfig(SelfChecked):
     refinement_period: float = param(
         2.0, 'Shortest time between two bundle adjustments; 0: none.', unit='s', minimum=0.0, maximum=3600.0, live=True
     )
-    image_rate: float = _image_rate()
-    realtime_priority: int = _realtime_priority()
 
 
 @dataclass(frozen=True)
@@ -652,18 +646,10 @@ class ImuNoise(SelfChecked):
 
 
 @dataclass(frozen=True)
-class PoseEkfConfig(SelfChecked):
+class PoseEkfConfig(ScheduleParameters, UncertainClockParameters, FrameParameters, MountParameters):
     """The filter."""
 
-    camera_position: tuple[float, ...] = _camera_position()
-    camera_orientation: tuple[float, ...] = _camera_orientation()
-    extrinsics: str = _extrinsics()
-    base_frame: str = _base_frame()
-    camera_frame: str = _camera_frame()
-    prefix_frames: bool = _prefix_frames()
-    camera_time_offset: float = _camera_time_offset()
     estimate_time_offset: bool = param(True, 'Estimate the error of camera_time_offset.')
-    time_offset_std: float = _time_offset_std()
     time_offset_random_walk: float = param(
         5.0e-5,
         'Random walk of the clock offset.',
@@ -796,11 +782,10 @@ class PoseEkfConfig(SelfChecked):
         'Also publish fmu/in/vehicle_visual_odometry at that rate, with the package px4_msgs.',
         needs=('bridge_rate',),
     )
-    realtime_priority: int = _realtime_priority()
 
 
 @dataclass(frozen=True)
-class ThermalSourceConfig(SelfChecked):
+class ThermalSourceConfig(FrameParameters, ImageParameters):
     """A camera driver, for cameras without one of their own."""
 
     camera: str = param(
@@ -819,13 +804,10 @@ class ThermalSourceConfig(SelfChecked):
         maximum=1000.0,
     )
     repeat: bool = param(True, 'Restart a folder or video at its end.')
-    calibration_file: str = _calibration_file()
-    frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
-    prefix_frames: bool = _prefix_frames()
 
 
 @dataclass(frozen=True)
-class LandingTargetConfig(SelfChecked):
+class LandingTargetConfig(FrameParameters, MountParameters):
     """The landing pad, for an autopilot behind mavros."""
 
     landing_pad: tuple[int, ...] = param(
@@ -836,12 +818,6 @@ class LandingTargetConfig(SelfChecked):
         'body: relative to the robot (ArduPilot; mavros with mav_frame BODY_FRD); map: in the map (PX4; LOCAL_NED).',
         choices=('body', 'map'),
     )
-    camera_position: tuple[float, ...] = _camera_position()
-    camera_orientation: tuple[float, ...] = _camera_orientation()
-    extrinsics: str = _extrinsics()
-    base_frame: str = _base_frame()
-    camera_frame: str = _camera_frame()
-    prefix_frames: bool = _prefix_frames()
     map_frame: str = param('map', 'Frame of the map.')
 
 
