@@ -139,24 +139,35 @@ def _view_figures(calibration: Calibration, views: Sequence[BoardView]) -> str:
         _view_figure(views[index], residual, enlarged, calibration)
         for index, residual in zip(calibration.views.tolist(), calibration.residuals, strict=True)
     ]
+    figures += [_dropped_figure(views[index], calibration) for index in calibration.dropped]
     text = f'<p>Residuals, measured minus predicted, are drawn {enlarged:.0f} times as long as they are.</p>'
     return f'{text}<div class="views">{"".join(figures)}</div>'
 
 
 def _view_figure(view: BoardView, residual: FloatArray, enlarged: float, calibration: Calibration) -> str:
-    width, height = calibration.camera.width, calibration.camera.height
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
     worst = float(np.linalg.norm(residual, axis=1).max())
+    lines = ''.join(
+        f'<path d="M{u:.1f} {v:.1f}l{du:.1f} {dv:.1f}"/>'
+        for (u, v), (du, dv) in zip(view.sighting.pixels.tolist(), (enlarged * residual).tolist(), strict=True)
+    )
+    caption = f'{len(residual)} points, rms {rms:.3f} px, largest {worst:.2f} px'
+    return _figure(view, lines, caption, calibration)
+
+
+def _dropped_figure(view: BoardView, calibration: Calibration) -> str:
+    return _figure(view, '', f'{len(view.sighting.pixels)} points, not used', calibration)
+
+
+def _figure(view: BoardView, lines: str, caption: str, calibration: Calibration) -> str:
+    """A view with its points, and ``lines`` from them."""
+    width, height = calibration.camera.width, calibration.camera.height
     size = width / 200.0
-    marks = []
-    for (u, v), (du, dv) in zip(view.sighting.pixels.tolist(), (enlarged * residual).tolist(), strict=True):
-        marks.append(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{size:.1f}"/>')
-        marks.append(f'<path d="M{u:.1f} {v:.1f}l{du:.1f} {dv:.1f}"/>')
+    points = ''.join(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{size:.1f}"/>' for u, v in view.sighting.pixels.tolist())
     return (
         f'<figure><svg viewBox="-0.5 -0.5 {width} {height}" role="img">{_thumbnail(view)}'
-        f'<g fill="none" stroke="#e6005c" stroke-width="{0.4 * size:.1f}">{"".join(marks)}</g></svg>'
-        f'<figcaption>{escape(view.name)}: {len(residual)} points, rms {rms:.3f} px, largest {worst:.2f} px'
-        f'</figcaption></figure>'
+        f'<g fill="none" stroke="#e6005c" stroke-width="{0.4 * size:.1f}">{points}{lines}</g></svg>'
+        f'<figcaption>{escape(view.name)}: {caption}</figcaption></figure>'
     )
 
 

@@ -120,8 +120,11 @@ class CircleGrid:
         missing: Sequence[tuple[int, int]] = (),
     ) -> None:
         pitch = spacing * np.sqrt(2.0) if asymmetric else spacing
-        if columns < 2 or rows < 3 or not 0.0 < diameter < pitch:
-            raise InputError('a circle grid needs 2 x 3 circles or more, and circles smaller than their spacing')
+        if columns < 2 or rows < 3:
+            raise InputError(f'a circle grid needs 2 x 3 circles or more, not {columns} x {rows}')
+        if not 0.0 < diameter < pitch:
+            apart = f'circles of {1e3 * diameter:g} mm, {1e3 * pitch:.3g} mm from one to the next'
+            raise InputError(f'{apart}: the circles of a grid are smaller than that')
         if longer < 0 or (asymmetric and longer not in (0, 1)):
             raise InputError('every other row may have one circle more, or in a symmetric grid several')
         places = [(c, r) for r in range(rows) for c in range(columns + longer * (r % 2))]

@@ -5,6 +5,7 @@ from pathlib import Path
 import sys
 
 from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.subcommands import add_remap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import parse_remaps
 
@@ -33,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--max-frames', type=int, default=1000, metavar='N', help='largest number of frames for the joint map'
     )
-    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='rename a topic of the bags')
+    add_remap(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.progress import tracked
-from thermal_fiducial.cli.subcommands import add_command, file_to_write
+from thermal_fiducial.cli.subcommands import add_command, add_remap, file_to_write
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
@@ -54,9 +54,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _add_camera_imu(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(do=_camera_imu)
-    parser.add_argument('bag', type=Path, help='bag with thermal/image_raw and imu/data, moving before mapped markers')
-    parser.add_argument('--map', type=Path, required=True, help='marker map (YAML)')
-    parser.add_argument('--calibration', type=Path, help='camera_info YAML (default: the camera_info of the bag)')
+    parser.add_argument(
+        'bag', type=Path, metavar='BAG', help='bag with thermal/image_raw and imu/data, moving before mapped markers'
+    )
+    parser.add_argument('--map', type=Path, required=True, metavar='FILE', help='marker map (YAML)')
+    parser.add_argument(
+        '--calibration', type=Path, metavar='FILE', help='camera_info YAML (default: the camera_info of the bag)'
+    )
     add_thickness(parser)
     parser.add_argument('--out', type=file_to_write, default=Path('extrinsics.yaml'), help='parameters to write')
     noise = ImuNoise()
@@ -68,7 +72,7 @@ def _add_camera_imu(parser: argparse.ArgumentParser) -> None:
     ):
         default = getattr(noise, name)
         parser.add_argument('--' + name.replace('_', '-'), type=float, default=default, metavar='X', help=f'[{unit}]')
-    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bag')
+    add_remap(parser)
 
 
 def _camera_imu(args: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermal_fiducial.calibration.sources import imu_track
-from thermal_fiducial.cli.subcommands import file_to_write
+from thermal_fiducial.cli.subcommands import add_remap, file_to_write
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.writing import write_text
@@ -24,9 +24,11 @@ _SHOWN = (0.01, 0.1, 1.0, 10.0, 100.0, 1000.0)
 def add_imu(parser: argparse.ArgumentParser) -> None:
     """Options of the action."""
     parser.set_defaults(do=calibrate_imu)
-    parser.add_argument('bag', type=Path, help='bag with imu/data, the robot at rest (minutes, better hours)')
+    parser.add_argument(
+        'bag', type=Path, metavar='BAG', help='bag with imu/data, the robot at rest (minutes, better hours)'
+    )
     parser.add_argument('--out', type=file_to_write, default=Path('imu.yaml'), help='parameters to write')
-    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bag')
+    add_remap(parser)
 
 
 def calibrate_imu(args: argparse.Namespace) -> int:

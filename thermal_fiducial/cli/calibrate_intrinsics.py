@@ -14,7 +14,7 @@ from thermal_fiducial.calibration.report import BoardView, write_report
 from thermal_fiducial.calibration.sources import is_folder_of_pictures, measured_points
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
 from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures
-from thermal_fiducial.cli.subcommands import file_to_write
+from thermal_fiducial.cli.subcommands import add_remap, file_to_write
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.mapping.map_data import MarkerMap
@@ -36,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         'source',
         type=Path,
+        metavar='SOURCE',
         help='folder of pictures (8 or 16 bit), a bag with thermal/image_raw, or a CSV file of measured points '
         '(columns view, point, u, v [px], x, y [m]; with --size)',
     )
@@ -43,12 +44,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--report', type=file_to_write, help='report to write (default: next to the calibration, .html)'
     )
-    parser.add_argument('--models', default=','.join(CANDIDATES), help='to choose among, by held-out error')
+    parser.add_argument(
+        '--models', default=','.join(CANDIDATES), metavar='NAMES', help='models to choose among, by held-out error'
+    )
     parser.add_argument('--focal-px', type=float, default=600.0, help='rough focal length to start from [px]')
     parser.add_argument('--most-views', type=int, default=80, help='stop looking for views after this many')
     parser.add_argument('--every', type=int, default=5, help='look at every n-th frame of a bag')
-    parser.add_argument('--size', type=int, nargs=2, metavar=('WIDTH', 'HEIGHT'), help='of the image, with a CSV file')
-    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bag')
+    parser.add_argument(
+        '--size', type=int, nargs=2, metavar=('WIDTH', 'HEIGHT'), help='size of the image, needed with a CSV file'
+    )
+    add_remap(parser)
     _add_board(parser.add_argument_group('board'))
 
 
@@ -64,15 +69,26 @@ def _add_board(group: argparse._ArgumentGroup) -> None:
         help='inner corners, or circles as OpenCV counts them (default: 8 6; circles 4 11; symmetric-circles 7 5)',
     )
     group.add_argument(
-        '--longer-rows', type=int, default=0, metavar='N', help='circles that every other row has more than COLUMNS'
+        '--longer-rows',
+        type=int,
+        default=0,
+        metavar='N',
+        help='number of circles by which every other row is longer than COLUMNS',
     )
     group.add_argument(
-        '--missing', action='append', default=[], metavar='COLUMN,ROW', help='a circle, from 0,0, that is not there'
+        '--missing',
+        action='append',
+        default=[],
+        metavar='COLUMN,ROW',
+        help='a circle that is not there, counted from 0,0; may be given several times',
     )
     group.add_argument(
-        '--spacing', type=float, metavar='MM', help='square, or between two rows of circles (default: 50; circles 25)'
+        '--spacing',
+        type=float,
+        metavar='MM',
+        help='side of a square, or distance between two rows of circles (default: 50; circles 25)',
     )
-    group.add_argument('--diameter', type=float, default=20.0, metavar='MM', help='of the circles')
+    group.add_argument('--diameter', type=float, default=20.0, metavar='MM', help='diameter of the circles')
     group.add_argument('--board', type=Path, metavar='MAP', help='marker map of a marker board')
 
 

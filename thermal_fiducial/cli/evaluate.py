@@ -30,7 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'ground_truth.tum in the bag that was replayed, if any)',
     )
     parser.add_argument(
-        '--truth-map', type=Path, metavar='FILE', help='the map as it really is (default: map_true.yaml beside it)'
+        '--truth-map',
+        type=Path,
+        metavar='FILE',
+        help='the map as it really is (default: map_true.yaml beside the ground truth)',
     )
     parser.add_argument('--bag', type=Path, help='the bag with the frames (default: where it was during the replay)')
     parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')

@@ -39,7 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0.3,
         help='standard deviation of corners without one of their own [px] (default: 0.3)',
     )
-    parser.add_argument('--late', type=float, default=0.0, metavar='S', help='delay of the frames (default: 0)')
+    parser.add_argument(
+        '--late',
+        type=float,
+        default=0.0,
+        metavar='S',
+        help='time from the stamp of a frame until it comes [s] (default: 0)',
+    )
     parser.add_argument(
         '--storage', choices=sorted(STORAGES), default='mcap', help='storage of the bag (default: mcap)'
     )

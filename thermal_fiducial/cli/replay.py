@@ -8,6 +8,7 @@ import sys
 import time
 
 from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.subcommands import add_remap
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import parse_remaps
 from thermal_fiducial.replay.earlier_runs import refuse_other_folder
@@ -32,7 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--transport',
         choices=('lockstep', 'processes'),
         default='lockstep',
-        help='one process, deterministic, as fast as it goes; or one process a node, in real time',
+        help='lockstep: all nodes in one process, deterministic, as fast as it goes; processes: one process a node, in '
+        'real time',
     )
     parser.add_argument(
         '--rate', type=float, default=1.0, metavar='X', help='speed of --transport processes, in multiples of real time'
@@ -43,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='NAME',
         help='play a second camera too, whose topics are in the namespace NAME: NAME/thermal/image_raw (default: none)',
     )
-    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='rename a topic of the bag')
+    add_remap(parser)
     parser.add_argument('--images', action='store_true', help='record the cleaned images too (as large as the bag)')
     parser.add_argument(
         '--from',

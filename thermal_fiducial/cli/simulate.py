@@ -77,10 +77,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _scenarios() -> str:
-    """Name and description of each scenario, on lines of at most 80 characters."""
+    """Name, length and description of each scenario, on lines of at most 80 characters."""
     return '\n'.join(
         textwrap.fill(
-            f'{item.description} ({item.seconds:g} s)', 80, initial_indent=f'  {name:14}', subsequent_indent=16 * ' '
+            item.description, 80, initial_indent=f'  {name:13}{item.seconds:3g} s  ', subsequent_indent=22 * ' '
         )
         for name, item in SCENARIOS.items()
     )

@@ -1,4 +1,4 @@
-"""Sub-commands of the program and of its commands, and a kind of argument that many have."""
+"""Sub-commands of the program and of its commands, and arguments that many have."""
 
 import argparse
 from pathlib import Path
@@ -10,6 +10,17 @@ Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 def add_command(commands: Commands, name: str, text: str) -> argparse.ArgumentParser:
     """Parser of a new sub-command; ``text`` stands in the list of them and in the sub-command's own help."""
     return commands.add_parser(name, help=text, description=text[0].upper() + text[1:])
+
+
+def add_remap(parser: argparse.ArgumentParser) -> None:
+    """Option ``--remap``, for :func:`thermal_fiducial.files.bags.parse_remaps`."""
+    parser.add_argument(
+        '--remap',
+        action='append',
+        default=[],
+        metavar='FROM:=TO',
+        help='rename a topic of the bag; may be given several times',
+    )
 
 
 def file_to_write(text: str) -> Path:

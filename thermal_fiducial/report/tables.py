@@ -107,6 +107,7 @@ _UNITS = {
     'time offset std': 's',
     'white pose error': 'sigma',
     'stamp jitter': 's',
+    'mount vibration': 'rad',
     'gyroscope bias': 'rad/s',
     'accelerometer bias': 'm/s^2',
     'gyroscope scale error': '1',

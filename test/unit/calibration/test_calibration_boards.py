@@ -261,10 +261,19 @@ def test_a_hole_shows_which_way_round_the_board_is():
     assert np.abs(sighting.pixels - truth[rows]).max() < 0.2
 
 
-@pytest.mark.parametrize('arguments', [{'longer': 2}, {'longer': -1}, {'missing': [(9, 0)]}])
-def test_unusable_circle_grids(arguments):
-    with pytest.raises(InputError):
-        CircleGrid(4, 11, 0.03, 0.024, **arguments)
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        ({'longer': 2}, 'one circle more'),
+        ({'longer': -1}, 'one circle more'),
+        ({'missing': [(9, 0)]}, r'no circle \(9, 0\)'),
+        ({'rows': 2}, '2 x 3 circles or more, not 4 x 2'),
+        ({'diameter': 0.06}, '60 mm, 42.4 mm from one to the next'),
+    ],
+)
+def test_unusable_circle_grids(arguments, words):
+    with pytest.raises(InputError, match=words):
+        CircleGrid(**({'columns': 4, 'rows': 11, 'spacing': 0.03, 'diameter': 0.024} | arguments))
 
 
 def test_circles_of_another_diameter_are_named_as_such():

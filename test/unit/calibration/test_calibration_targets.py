@@ -159,11 +159,11 @@ def test_a_board_of_circles_is_calibrated_with_as_it_was_drawn(tmp_path, capsys)
 def test_points_that_were_measured_elsewhere(tmp_path, capsys):
     rng, out = np.random.default_rng(4), tmp_path / 'camera.yaml'
     lines = ['view,point,u,v,x,y']
-    for view in range(9):
+    for view in range(10):
         pixels = LENS.project(se3.apply(random_view(LENS, CHESSBOARD.points, rng), CHESSBOARD.points))
-        for point, (uv, xyz) in enumerate(
-            zip(pixels + rng.normal(0.0, 0.02, pixels.shape), CHESSBOARD.points, strict=True)
-        ):
+        # The last view was measured badly.
+        noise = rng.normal(0.0, 0.02 if view < 9 else 4.0, pixels.shape)
+        for point, (uv, xyz) in enumerate(zip(pixels + noise, CHESSBOARD.points, strict=True)):
             lines.append(f'v{view},{point},{uv[0]:.4f},{uv[1]:.4f},{xyz[0]:.4f},{xyz[1]:.4f}')
     table = tmp_path / 'points.csv'
     table.write_text('\n'.join(lines))
@@ -171,7 +171,12 @@ def test_points_that_were_measured_elsewhere(tmp_path, capsys):
     assert main([*command, '--size', '640', '512']) == 0
     # Nine views in place of forty.
     assert load_camera(out).K[0, 0] == pytest.approx(LENS.focal[0], rel=1e-3)
-    assert 'v8: 48 points' in out.with_suffix('.html').read_text()
+    page = out.with_suffix('.html').read_text()
+    assert 'v8: 48 points, rms' in page
+    # A view that was dropped is drawn too, without residuals.
+    assert 'v9: 48 points, not used' in page
+    seen = page[page.index('class="views"') :]
+    assert seen.count('<circle') == seen.count('<path') + 48 == 480
     capsys.readouterr()
     for broken, words in (('v0,0,1,1,0,0', 'second time'), ('v0,99,x,1,0,0', 'numbers'), ('v0,99,-9,1,0,0', 'outside')):
         table.write_text('\n'.join([*lines, broken]))

@@ -144,7 +144,14 @@ def test_units_stand_in_every_table(page):
 def test_figures_of_the_diagnostics_are_not_shown_beside_those_of_all_poses(run_folder):
     """What the nodes say of their latest poses must not stand beside the figures of all, under the same names."""
     summary = json.loads((run_folder / 'summary.json').read_text())
-    said = {'pose_ekf': {'poses refused': '7', 'NIS per d.o.f.': '0.81', 'position std': '0.004'}}
+    said = {
+        'pose_ekf': {
+            'poses refused': '7',
+            'NIS per d.o.f.': '0.81',
+            'position std': '0.004',
+            'mount vibration': '1e-05',
+        }
+    }
     (run_folder / 'summary.json').write_text(json.dumps(summary | {'diagnostics': said}))
     evaluation, numbers = evaluate_run(run_folder)
     page = without_library(write_page(evaluation, numbers).read_text())
@@ -155,6 +162,7 @@ def test_figures_of_the_diagnostics_are_not_shown_beside_those_of_all_poses(run_
         in page
     )
     assert 'position std</td><td class="text">0.004</td><td class="text">m</td>' in page
+    assert 'mount vibration</td><td class="text">1e-05</td><td class="text">rad</td>' in page
 
 
 def test_without_truth_there_are_no_errors_rather_than_false_ones(tmp_path):
