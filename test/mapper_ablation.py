@@ -46,10 +46,10 @@ def _ignored(*_: Any, **__: Any) -> None:
 
 MECHANISMS = {
     'learned bias of corners': Mechanism(
-        ('wrong lens', 'board', 'moved markers'), ('trust:CornerBias',), {'trust:CornerBias.add': _ignored}
+        ('wrong lens', 'board', 'moved markers'), ('corner_bias:CornerBias',), {'corner_bias:CornerBias.add': _ignored}
     ),
-    'weights by running errors': Mechanism(
-        ('moved markers', 'board', 'carpet'),
+    'weights by errors': Mechanism(
+        ('moved markers', 'uneven map', 'board', 'carpet'),
         ('localization:marker_weights',),
         {'localization:marker_weights': lambda errors, *_: np.ones(len(errors))},
     ),
@@ -96,8 +96,18 @@ MECHANISMS = {
     ),
     'quarantine': Mechanism(
         ('moved markers', 'two sheets'),
-        ('trust:Trust.update', 'trust:inconsistent'),
-        {'trust:inconsistent': lambda disagrees, _: np.zeros_like(disagrees)},
+        ('consistency:Consistency.judge', 'consistency:inconsistent'),
+        {'consistency:inconsistent': lambda disagrees, _: np.zeros_like(disagrees)},
+    ),
+    'misplaced marker alone in view': Mechanism(
+        ('second plate',),
+        (
+            'consistency:Consistency.checked',
+            'consistency:Consistency._at_first_sight',
+            'consistency:Consistency.add',
+            'located:MisplacedMarker',
+        ),
+        {'consistency:Consistency.checked': lambda self, frame: frame},
     ),
     'three trials a frame': Mechanism(('carpet',), (), {'candidates:TRIALS': 10**9}),
     'best-known proposers': Mechanism(('carpet',), (), {'localization:_PROPOSERS': 10**9}),

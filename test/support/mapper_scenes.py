@@ -267,6 +267,28 @@ def second_flight() -> Figures:
     return _figures_of_maps(maps)
 
 
+def second_plate() -> Figures:
+    """Six known markers in view, then for 4 s one of them alone, a second plate of it; odometry drifts meanwhile."""
+    rng = np.random.default_rng(6)
+    poses = walls.wall(rng, 6)
+    elsewhere = {2: transform(np.eye(3), [0.0, 1.2, 0.0]) @ poses[2]}
+    known = MarkerMap({key: MapMarker(key, walls.SIZE, True, T) for key, T in poses.items()})
+    mapper = MarkerMapper(MarkerMapperConfig(mode='localization', **AS_BODY), known)
+    located = []
+    for k in range(0, 180, 2):
+        T, stamp, seconds = walls.flight(k / 30), walls.stamp(k), max(k - 60, 0) / 30
+        # Without poses that it accepts, a filter's position drifts with the square of the time.
+        stds = np.array([0.01 + 0.02 * seconds**2] * 3 + [0.003 + 0.002 * seconds] * 3)
+        state = Odometry(
+            stamp, retract(T, 0.5 * stds), np.zeros(3), np.zeros(3), np.diag(stds**2), np.diag([0.03**2] * 6)
+        )
+        rows = walls.see(T, poses if seconds == 0.0 else elsewhere, 0.1, rng)
+        pose = mapper.process(stamp, rows, walls.CAMERA, motion_prior(state)).pose
+        if pose is not None:
+            located.append(np.linalg.norm(difference(pose.T_map_camera, T)[:3]))
+    return {'located': len(located), 'worst pose mm': 1e3 * max(located)}
+
+
 def two_sheets() -> Figures:
     """One of eight markers that are being mapped is there twice, its two sheets seen in turn; or is moved half-way."""
     named, others = 0, []
@@ -336,6 +358,7 @@ SCENES: dict[str, Callable[[], Figures]] = {
     'uneven map': uneven_map,
     'second flight': second_flight,
     'two sheets': two_sheets,
+    'second plate': second_plate,
     'optimistic corners': optimistic_corners,
 }
 if 'THERMAL_FIDUCIAL_DATA' in os.environ:

@@ -8,7 +8,6 @@ the pose jump by what the markers are wrong by.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,8 +27,8 @@ class SystematicErrors:
     #: Distance over which that error stays the same [share of the image's width]: a lens model is wrong by a smooth
     #: function. On the same board lengths of 0.1 to 0.25 fit, 0.5 leaves NEES 1.1, 1.0 leaves 1.25.
     corner_length: float = 0.25
-    #: Corners [px] where one hypothesis is weighed against another, and the limit below which no marker is worth more
-    #: than its neighbours. Enters the fit of new markers, the choice between two poses, and weights.
+    #: Corners [px] where one hypothesis is weighed against another. Enters the fit of new markers, the choice between
+    #: two poses, and weights by the map.
     decision_px: float = 0.1
     #: Common relative error of the markers' sides: ways of measuring tags on one carpet differ by 1.2 %, a laser
     #: cutter's kerf of 0.3 mm is 0.1 %. Enters poses from markers (:func:`of_single_error`) and the map
@@ -115,55 +114,6 @@ def corners_of_pose(gains: FloatArray, correlations: FloatArray, errors: Systema
     n, m, _ = gains.shape
     mixed = (correlations @ gains.reshape(n, 2 * m)).reshape(n, m, 2)
     return np.asarray(errors.corner_px**2 * np.tensordot(gains, mixed, axes=([0, 2], [0, 2])))
-
-
-class ShownErrors(NamedTuple):
-    """What residuals of a pose show of the corners' systematic errors: sums per coordinate.
-
-    If each corner has an error of its own, of variance s^2, and all share one that is smooth over the image, of
-    variance b^2, ``product`` is expected to be ``s^2 own + b^2 smooth`` and ``smooth_product``
-    ``s^2 smooth + b^2 both``
-    (minimum norm quadratic estimation of variance components; C. R. Rao, 1971).
-    """
-
-    #: product of successive residuals, and the same weighted by the correlations of the smooth error [px^2]
-    product: float
-    smooth_product: float
-    own: float
-    smooth: float
-    both: float
-
-    def smooth_variance(self, known: float) -> float:
-        """Variance b^2 [px^2], without errors of corners of their own as far as they are ``known`` in ``product``.
-
-        More of these than the detector knows of is taken for a sign of smooth errors: a lens model that is wrong within
-        a marker is worse over the whole image, where the pose hides it.
-        """
-        own = (self.product * self.both - self.smooth_product * self.smooth) / (self.own * self.both - self.smooth**2)
-        return (self.product - min(max(own, 0.0) * self.own, known)) / self.smooth
-
-
-def shown_errors(J: FloatArray, correlations: FloatArray, residuals: FloatArray, former: FloatArray) -> ShownErrors:
-    """What the residuals (n, 2) [px] of n corners and the ``former`` ones of the same corners show.
-
-    Parameters
-    ----------
-    J : (n, 2, 6) derivatives of the corners with respect to the pose
-    correlations : (n, n) of the smooth error
-    """
-    n = len(J)
-    # The pose takes up errors along six orthonormal directions.
-    directions = np.linalg.qr(J.reshape(2 * n, 6))[0]
-    correlated = (correlations @ directions.reshape(n, 12)).reshape(2 * n, 6)
-    taken_up = directions.T @ correlated
-    sums = (
-        np.vdot(residuals, former),
-        np.vdot(residuals, correlations @ former),
-        2.0 * n - 6.0,
-        2.0 * correlations.trace() - taken_up.trace(),
-        2.0 * np.vdot(correlations, correlations) - 2.0 * np.vdot(correlated, correlated) + np.vdot(taken_up, taken_up),
-    )
-    return ShownErrors(*(float(value) / (2.0 * n) for value in sums))
 
 
 def map_of_pose(

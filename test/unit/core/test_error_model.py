@@ -17,10 +17,10 @@ from thermal_fiducial.core.error_model import (
     SystematicErrors,
 )
 from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.mapping.corner_bias import CornerBias
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.mapping.trust import CornerBias
 from thermal_fiducial.core.measurements import CORNER_FIELDS, corners_px
 
 ERRORS = SystematicErrors()

@@ -6,7 +6,6 @@ filled environments", ISVC 2018.
 
 from dataclasses import dataclass, replace
 import math
-from statistics import median
 
 import numpy as np
 
@@ -66,7 +65,7 @@ def locate(
     if not np.all(np.isfinite(seen.residuals)):
         return Refusal(f'no camera pose explains {names(sight)}')
     # Steps 5 and 6: refined with the weights of their errors.
-    found = frame.refined(T, seen, by_map * marker_weights(seen.errors_px, sight.running_px, model))
+    found = frame.refined(T, seen, by_map * marker_weights(seen.errors_px, sight.noise_px, model))
     T_other = None if found is None else frame.alternative(found, hypotheses)
     if found is None or T_other is None:
         return found or Refusal(f'the pose from {names(sight)} is not determined')
@@ -192,15 +191,18 @@ class _JointFit:
         return map_weights(sight.noise_px, self.camera.focal_px * np.sqrt(apart) / distances, self.model)
 
 
-def marker_weights(errors: FloatArray, running_errors: FloatArray, model: SystematicErrors) -> FloatArray:
-    """Step 5 of Algorithm 1: weights (N,) from the present and the running re-projection error of each marker [px].
+def marker_weights(errors_px: FloatArray, noise_px: FloatArray, model: SystematicErrors) -> FloatArray:
+    """Step 5 of Algorithm 1: weights (N,) of markers by their re-projection errors, rms [px].
 
-    A marker whose error is at most the median, or at most ``decision_px``, has weight 1; a worse one the ratio of the
-    squares.
+    That is the expected variance, of noise and bias of the corners, over the present one, at most 1. Both coordinates
+    of a corner make its error.
+
+    Parameters
+    ----------
+    noise_px : (N,) standard deviation of a coordinate of the corners
     """
-    combined = 0.5 * (errors**2 + np.where(running_errors > 0.0, running_errors, errors) ** 2)
-    reference = max(median(combined.tolist()), model.decision_px**2)
-    return np.asarray(np.minimum(1.0, reference / np.maximum(combined, TINY)))
+    expected = 2.0 * (noise_px**2 + model.corner_px**2)
+    return np.asarray(np.minimum(1.0, expected / np.maximum(errors_px**2, TINY)))
 
 
 def _hypotheses(sight: Sight, prior: FloatArray | None) -> FloatArray:

@@ -1,6 +1,5 @@
 """Records of localization: the known markers of a frame, their re-projection, and the located frame."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 import math
@@ -15,7 +14,7 @@ from thermal_fiducial.core.error_model import (
 )
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, linearise
-from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Observations
 from thermal_fiducial.core.motion_prior import PredictedCamera
@@ -34,8 +33,6 @@ class Sight(Stacked):
     observed: Observations
     #: (N,) standard deviation of a coordinate of the corners of each, rms [px]
     noise_px: FloatArray
-    #: (N,) running rms re-projection error of each [px]; 0 before the first observation
-    running_px: FloatArray
     #: (N,) of MapMarker, and which of them are not in quarantine
     markers: ObjectArray
     trusted: BoolArray
@@ -49,10 +46,8 @@ class Sight(Stacked):
     scale_arms: FloatArray
 
     @staticmethod
-    def of(
-        observed: Observations, marker_map: MarkerMap, running_px: Callable[[Iterable[MapMarker]], FloatArray]
-    ) -> 'Sight':
-        """The observed markers, all in the map, with their entries there; ``running_px`` of such entries."""
+    def of(observed: Observations, marker_map: MarkerMap) -> 'Sight':
+        """The observed markers, all in the map, with their entries there."""
         known = [marker_map.markers[key] for key in observed.ids.tolist()]
         sizes = np.array([marker.size for marker in known])
         T_map_marker = np.array([marker.T_map_marker for marker in known]).reshape(-1, 4, 4)
@@ -62,7 +57,6 @@ class Sight(Stacked):
         return Sight(
             observed,
             np.sqrt(np.einsum('nckk->n', observed.covariances) / 8.0),
-            running_px(known),
             np.array(known, dtype=np.object_),
             np.array([marker.trusted for marker in known], dtype=np.bool_),
             corners_in_map(T_map_marker, sizes),

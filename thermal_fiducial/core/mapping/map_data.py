@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
+import math
 
 import numpy as np
 
@@ -16,6 +17,8 @@ _OUTLIER = 4.0
 # Residual that is never an outlier [m].
 _TOLERANCE_M = 0.01
 _REWEIGHTINGS = 4
+# Weight of a new frame in a marker's running error: a memory of 20 frames.
+_ERROR_MEMORY = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +48,13 @@ class MapMarker:
 
     def seen(self, stamp_ns: int, error_px: float) -> 'MapMarker':
         """The marker after one more observation; without ``replace``, as this runs for every marker of every frame."""
+        count = self.observations + 1
+        mean_square = self.reprojection_error_px**2
+        mean_square += max(1.0 / count, _ERROR_MEMORY) * (error_px**2 - mean_square)
         first = self.first_seen_ns if self.observations else stamp_ns
         return MapMarker(
             self.id, self.size, self.fixed, self.T_map_marker, self.covariance,
-            error_px, self.observations + 1, first, stamp_ns, self.trusted,
+            math.sqrt(mean_square), count, first, stamp_ns, self.trusted,
         )  # fmt: skip
 
 

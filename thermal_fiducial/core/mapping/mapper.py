@@ -2,8 +2,8 @@
 
 S. Khattak, C. Papachristos, K. Alexis, "Marker based thermal-inertial localization for aerial robots in obscurant
 filled environments", ISVC 2018. For every frame: split the markers into known and new ones, estimate the camera pose
-from all known ones jointly, weight each by its present and running re-projection error, refine, update the errors, and
-place new markers observed together with known ones. Beyond the paper: planar ambiguities are resolved before a marker
+from all known ones jointly, weight each by its re-projection error, refine, update the errors, and place new markers
+observed together with known ones. Beyond the paper: planar ambiguities are resolved before a marker
 enters the map, covariances contain the map's uncertainty, and inconsistent markers are put in quarantine.
 """
 
@@ -20,18 +20,13 @@ from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarkers
-from thermal_fiducial.core.mapping.contradiction import (
-    are_two_that_contradict,
-    contradicting,
-    MisplacedMarkers,
-    settled,
-)
+from thermal_fiducial.core.mapping.consistency import are_two_that_contradict, Consistency, contradicting, settled
+from thermal_fiducial.core.mapping.corner_bias import CornerBias
 from thermal_fiducial.core.mapping.keyframes import KeyframeStore
 from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import jump, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
-from thermal_fiducial.core.mapping.trust import CornerBias, Trust
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera
 from thermal_fiducial.core.types import FloatArray
@@ -85,13 +80,10 @@ class MarkerMapper:
     def _begin(self, marker_map: MarkerMap) -> None:
         self._initial, self.map = marker_map.copy(), marker_map.copy()
         self._new = NewMarkers(self.config.marker_size, size_overrides(self.config.marker_size_overrides))
-        self._trust = Trust(self.map.markers)
+        self._consistency = Consistency(self.map.markers)
         self._bias = CornerBias()
-        self._misplaced = MisplacedMarkers()
         #: the last pose that nothing contradicted
         self._last: CameraPose | None = None
-        #: whether odometry has agreed with the markers since the map was loaded
-        self._odometry_agreed = False
         self._keyframes = KeyframeStore(self.config.keyframe_budget, self._initial)
 
     def process(
@@ -113,7 +105,7 @@ class MarkerMapper:
         # Step 2: known and new markers.
         is_known = np.array([key in self.map.markers for key in observed.ids.tolist()], dtype=np.bool_)
         own = observed if is_known.all() else observed.only(is_known)
-        known = Sight.of(own, self.map, self._trust.running_errors)
+        known = Sight.of(own, self.map)
         offset_std = self.config.time_offset_std
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
@@ -126,7 +118,7 @@ class MarkerMapper:
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
         frame = LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome)
-        return self._misplaced.checked(frame)
+        return self._consistency.checked(frame)
 
     def _located(
         self, stamp_ns: int, sight: Sight, camera: Camera, predicted: PredictedCamera | None
@@ -158,34 +150,28 @@ class MarkerMapper:
         changed = updated = False
         if isinstance(outcome, Refusal):
             changed, waiting = self._without_pose(frame, outcome)
-        elif frame.contradicts_odometry and self._odometry_agreed:
+        elif frame.contradicts_odometry and self._consistency.odometry_agreed:
             # Probably a moved or duplicated marker: an update would corrupt the map.
             waiting = dict.fromkeys(frame.new.ids.tolist(), CONTRADICTED)
         else:
-            self._odometry_agreed |= frame.predicted is not None and not frame.contradicts_odometry
             self._last, updated = outcome.pose, True
             # Step 7: errors updated.
             self._bias.add(outcome)
-            errors, left_out = frame.known_errors(outcome), frame.left_out(outcome)
-            changed = self._trust.update(self.map.markers, frame.known.markers, *errors, left_out)
+            known, (errors, error_stds) = frame.known.markers, frame.known_errors(outcome)
+            changed = self._consistency.judge(self.map.markers, known, errors, error_stds, frame.left_out(outcome))
             # Step 8: new markers placed relative to the camera.
             if not self.frozen:
-                self._count(frame)
+                for marker, error in zip(known, errors.tolist(), strict=True):
+                    self.map.markers[marker.id] = self.map.markers[marker.id].seen(frame.stamp_ns, error)
                 self._keyframes.keep(frame.observed, outcome.pose, frame.camera, frame.predicted)
                 if not frame.is_known.all():
                     placed, waiting = self._place_new(frame, outcome.viewpoint)
                     changed |= placed
-        self._misplaced.add(frame)
+        self._consistency.add(frame)
         return MapperResult(
             frame.stamp_ns, frame.pose, outcome.reason, changed, frozenset(frame.known.observed.ids.tolist()), waiting,
-            dict(self._trust.quarantined), not self.frozen and (changed or updated),
+            dict(self._consistency.quarantined), not self.frozen and (changed or updated),
         )  # fmt: skip
-
-    def _count(self, frame: LocatedFrame) -> None:
-        """Note the known markers of a frame as observed, with their running errors."""
-        known = frame.known.markers
-        for marker, running in zip(known, self._trust.running_errors(known).tolist(), strict=True):
-            self.map.markers[marker.id] = self.map.markers[marker.id].seen(frame.stamp_ns, running)
 
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, Waiting]:
         """Add views to the candidates of new markers; whether any entered the map, and what the others wait for."""
@@ -242,7 +228,7 @@ class MarkerMapper:
         if self.frozen or refinement.map_revision < self._initial.revision:
             return False
         self.map.adjust(refinement.markers)
-        self._trust.flag(self.map.markers, refinement.inconsistent)
+        self._consistency.flag(self.map.markers, refinement.inconsistent)
         self._new.move(self._keyframes.move(refinement.keyframes))
         self.resets += 1
         return True

@@ -1,7 +1,6 @@
 """The camera in a map of known markers: the joint fit, its weights, and the planar ambiguity."""
 
 import numpy as np
-import pytest
 from support.walls import CAMERA, flight, look, see, SIZE, wall
 
 from thermal_fiducial.core.error_model import SystematicErrors
@@ -18,7 +17,7 @@ MODEL = SystematicErrors()
 def located(T, poses, rows, prior=None):
     """``locate`` with the markers of ``rows`` in a map of ``poses``."""
     marker_map = MarkerMap({key: MapMarker(key, SIZE, True, pose) for key, pose in poses.items()})
-    sight = Sight.of(Observations.of(rows), marker_map, lambda markers: np.zeros(len(list(markers))))
+    sight = Sight.of(Observations.of(rows), marker_map)
     return locate(0, sight, CAMERA, prior, MODEL)
 
 
@@ -54,15 +53,8 @@ def test_the_pose_that_is_nearer_to_the_prior_settles_the_ambiguity_of_a_far_mar
         assert d @ np.linalg.solve(outcome.pose.covariance, d) < 1e-2
 
 
-@pytest.mark.parametrize(
-    ('errors', 'running', 'expected'),
-    [
-        # No worse than the median, or than what a decision allows, counts in full.
-        ([0.1, 0.2, 0.3], [0.0, 0.0, 0.0], [1.0, 1.0, 0.2**2 / 0.3**2]),
-        ([1e-3, 2e-3, 3e-3], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]),
-        # The running error counts as much as the present one.
-        ([0.2, 0.2, 0.2], [0.2, 0.2, 0.6], [1.0, 1.0, 0.2**2 / (0.5 * (0.2**2 + 0.6**2))]),
-    ],
-)
-def test_weights_are_ratios_of_squared_errors(errors, running, expected):
-    np.testing.assert_allclose(marker_weights(np.array(errors), np.array(running), MODEL), expected)
+def test_weights_are_expected_over_present_variances_and_at_most_one():
+    """A coordinate has noise of 0.1 and 0.2 px and a bias of 0.1 px: 0.2 px and 0.32 px are expected of both."""
+    errors, noise = np.array([0.1, 0.2, 0.4, 0.4]), np.array([0.1, 0.1, 0.1, 0.2])
+    weights = marker_weights(errors, noise, SystematicErrors(corner_px=0.1))
+    np.testing.assert_allclose(weights, [1.0, 1.0, 0.2**2 / 0.4**2, 0.1 / 0.4**2])

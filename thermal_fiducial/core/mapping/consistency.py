@@ -1,11 +1,13 @@
-"""Known markers that contradict each other, or odometry: which of them has moved, or is a second plate of its ID.
+"""Which known markers are where the map has them.
 
-Of three markers one that has moved is an outlier of a robust fit. Of two either may have moved: the robust fit follows
-one of them, now this and now that. What is unknown is discrete, which of them it is, and the camera as predicted by
-odometry is the measurement that decides it. A marker alone in view has nothing but odometry to contradict.
+One that was moved, exists twice or has a wrong pose in the map contradicts the others in view, or odometry. Of three
+such a marker is an outlier of a robust fit. Of two either may have moved: the robust fit follows one of them, now this
+and now that. What is unknown is discrete, which of them it is, and the camera as predicted by odometry is the
+measurement that decides it. A marker alone in view has nothing but odometry to contradict. One such frame is an
+outlier; most frames of a second are evidence, and put the marker in quarantine.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,11 +26,19 @@ from thermal_fiducial.core.mapping.located import (
     Sight,
     squared_distance,
 )
-from thermal_fiducial.core.mapping.trust import DISAGREEMENT
+from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.motion_prior import PredictedCamera
-from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray, SECOND_NS
 
+#: Reason of quarantine of markers that the map file already had there.
+FROM_FILE = 'in quarantine since before the map was loaded'
+#: Weight of a new frame in the share of inconsistent frames: a memory of 20 frames.
+MEMORY = 0.05
+#: Share of inconsistent frames above which a marker is put in quarantine, and below which it is released.
+QUARANTINE, RELEASE = 0.7, 0.1
+#: Ratio of an error to its standard deviation above which a frame counts as inconsistent.
+DISAGREEMENT = 4.0
 #: Markers that must have agreed with odometry for it to count against another: two against one.
 _WITNESSES = 2
 #: A marker is misplaced from this distance on [m]: where odometry is wrong by less, following the marker costs less
@@ -86,19 +96,29 @@ def contradicting(sight: Sight) -> Refusal:
     return Refusal(f'{names(sight)} contradict each other')
 
 
-class MisplacedMarkers:
-    """The marker, if any, that alone in view contradicts odometry and the markers which bear it out.
+class Consistency:
+    """What the frames say of the known markers: a quarantine, and the marker that alone in view is misplaced.
 
-    From the marker's own views nothing can be learned about which is right: they all agree with each other, and after
-    some seconds without another marker odometry has drifted so far that it contradicts nothing. So what the first
-    view showed is remembered, until the marker is back in its place, is seen with another one, or a second marker
-    contradicts odometry too: then it is odometry that is wrong.
+    From the own views of a marker alone in view nothing can be learned about which is right, it or odometry: they all
+    agree with each other, and after some seconds without another marker odometry has drifted so far that it contradicts
+    nothing. So what the first view showed is remembered, until the marker is back in its place, is seen with another
+    one, or a second marker contradicts odometry too: then it is odometry that is wrong.
+
+    Parameters
+    ----------
+    markers : of the map
     """
 
-    def __init__(self) -> None:
-        self._misplaced: MisplacedMarker | None = None
+    def __init__(self, markers: Mapping[int, MapMarker]) -> None:
+        #: markers in quarantine, each with the reason in words
+        self.quarantined = {key: FROM_FILE for key, marker in markers.items() if not marker.trusted}
+        # Shares of inconsistent frames by ID: markers that the file has in quarantine stay until frames release them.
+        self._shares = dict.fromkeys(self.quarantined, 1.0)
+        #: whether odometry has agreed with any marker since the map was loaded
+        self.odometry_agreed = False
         #: IDs of markers that have agreed with odometry
         self._witnesses: set[int] = set()
+        self._misplaced: MisplacedMarker | None = None
         #: stamp of the last pose that contradicted it [ns]
         self._contradicted_ns: int | None = None
 
@@ -127,7 +147,7 @@ class MisplacedMarkers:
         return MisplacedMarker(marker_id, frame.stamp_ns, T_moved, distance) if distance >= _FAR else None
 
     def add(self, frame: LocatedFrame) -> None:
-        """Update with a frame and its outcome."""
+        """Note whether a frame and its outcome agree with odometry."""
         outcome = frame.outcome
         if isinstance(outcome, Refusal):
             self._misplaced = outcome.misplaced or self._misplaced
@@ -139,9 +159,100 @@ class MisplacedMarkers:
                 # It is the second one.
                 self._misplaced, self._witnesses = None, set()
         elif frame.predicted:
+            self.odometry_agreed = True
             self._witnesses |= ids
         if self._misplaced and self._misplaced.id in ids:
             self._misplaced = None
+
+    def judge(
+        self,
+        markers: dict[int, MapMarker],
+        known: ObjectArray,
+        errors_px: FloatArray,
+        error_std_px: FloatArray,
+        left_out: BoolArray,
+    ) -> bool:
+        """Put persistently inconsistent markers in quarantine after a frame, and release consistent ones.
+
+        Parameters
+        ----------
+        markers : of the map; those that enter or leave quarantine are replaced
+        known : the N of them in the frame
+        errors_px, error_std_px : (N,) their rms re-projection errors, and the standard deviations of these
+        left_out : (N,) which of them the pose left out, as odometry contradicts them: inconsistent
+
+        Returns
+        -------
+        Whether any marker entered or left quarantine.
+        """
+        if len(known) < 2:
+            return False
+        ratios = errors_px / error_std_px
+        blamed = ratios > DISAGREEMENT
+        if blamed.any():
+            blamed = inconsistent(blamed, known.tolist())
+        blamed = blamed | left_out
+        changed = False
+        columns = blamed.tolist(), errors_px.tolist(), ratios.tolist()
+        for marker, bad, error, ratio in zip(known, *columns, strict=True):
+            share = self._shares.get(marker.id, 0.0)
+            share += MEMORY * (bad - share)
+            self._shares[marker.id] = share
+            if marker.trusted and share > QUARANTINE:
+                in_frames = f'in most of the last {1.0 / MEMORY:.0f} frames'
+                self._set_standing(markers, marker.id, f'{error:.1f} px off, {ratio:.1f} sigma, {in_frames}')
+            elif not marker.trusted and share < RELEASE:
+                self._set_standing(markers, marker.id, '')
+            else:
+                continue
+            changed = True
+        return changed
+
+    def flag(self, markers: dict[int, MapMarker], outliers: Mapping[int, float]) -> None:
+        """Put markers in quarantine that a bundle adjustment found inconsistent; frames may release them later.
+
+        Parameters
+        ----------
+        outliers : ID to the share of its views that are inconsistent
+        """
+        for marker_id, share in outliers.items():
+            if marker_id not in markers or not markers[marker_id].trusted:
+                continue
+            self._shares[marker_id] = 1.0
+            reason = f'{100.0 * share:.0f} % of its views contradict the joint refinement'
+            self._set_standing(markers, marker_id, reason)
+
+    def _set_standing(self, markers: dict[int, MapMarker], marker_id: int, reason: str) -> None:
+        """Put one of ``markers`` in quarantine for a ``reason``, or release it if that is empty."""
+        markers[marker_id] = replace(markers[marker_id], trusted=not reason)
+        self.quarantined.pop(marker_id, None)
+        if reason:
+            self.quarantined[marker_id] = reason
+
+
+def inconsistent(disagrees: np.ndarray, markers: Sequence[MapMarker]) -> np.ndarray:
+    """Which of the disagreeing markers count as inconsistent, (N,) bool.
+
+    With three or more, all that disagree: a robust pose follows the majority. Of two, not the fixed one, nor the one
+    observed more than four times as often; if neither applies, none.
+    """
+    trusted = np.array([marker.trusted for marker in markers], dtype=bool)
+    if np.count_nonzero(trusted) != 2 or not np.any(disagrees & trusted):
+        return disagrees
+    a, b = np.flatnonzero(trusted).tolist()
+    blamed = disagrees & ~trusted
+    preference = _preference(markers[a], markers[b])
+    if preference:
+        blamed[b if preference > 0 else a] = True
+    return np.asarray(blamed)
+
+
+def _preference(a: MapMarker, b: MapMarker) -> int:
+    if a.fixed != b.fixed:
+        return 1 if a.fixed else -1
+    if a.observations > 4 * b.observations:
+        return 1
+    return -1 if b.observations > 4 * a.observations else 0
 
 
 def _is_back(misplaced: MisplacedMarker, pose: CameraPose, predicted: PredictedCamera | None) -> bool:

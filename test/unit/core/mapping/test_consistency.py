@@ -3,55 +3,42 @@
 import numpy as np
 import pytest
 
+from thermal_fiducial.core.mapping.consistency import Consistency, inconsistent
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.mapping.trust import inconsistent, Trust
 
 
 def markers(count=4, **values):
     return {key: MapMarker(key, 0.3, False, np.eye(4), **values) for key in range(count)}
 
 
-def frame(trust, known, errors_px, left_out=()):
+def frame(state, known, errors_px, left_out=()):
     """A frame in which each of the first markers has its error, of 0.1 px that are explained."""
     count = len(errors_px)
     seen = np.array([known[key] for key in range(count)], dtype=np.object_)
-    return trust.update(known, seen, np.array(errors_px), np.full(count, 0.1), np.isin(np.arange(count), left_out))
+    return state.judge(known, seen, np.array(errors_px), np.full(count, 0.1), np.isin(np.arange(count), left_out))
 
 
 def test_a_marker_off_in_most_frames_of_a_second_is_quarantined_and_one_that_fits_again_released():
     known = markers()
-    trust = Trust(known)
-    changes = [frame(trust, known, [0.1, 0.1, 0.1, 2.0]) for _ in range(40)]
+    state = Consistency(known)
+    changes = [frame(state, known, [0.1, 0.1, 0.1, 2.0]) for _ in range(40)]
     # 1 - 0.95^n exceeds 0.7 with the 24th frame.
     assert changes.index(True) == 23
     assert sum(changes) == 1
     assert not known[3].trusted
-    assert trust.quarantined == {3: '2.0 px off, 20.0 sigma, in most of the last 20 frames'}
-    changes = [frame(trust, known, [0.1, 0.1, 0.1, 0.1]) for _ in range(60)]
+    assert state.quarantined == {3: '2.0 px off, 20.0 sigma, in most of the last 20 frames'}
+    changes = [frame(state, known, [0.1, 0.1, 0.1, 0.1]) for _ in range(60)]
     assert sum(changes) == 1
     assert known[3].trusted
-    assert trust.quarantined == {}
+    assert state.quarantined == {}
 
 
 @pytest.mark.parametrize('errors', [[2.0], [0.1, 0.1, 0.3]])
 def test_one_marker_alone_and_errors_within_four_sigma_are_no_evidence(errors):
     known = markers()
-    trust = Trust(known)
-    assert not any(frame(trust, known, errors) for _ in range(100))
+    state = Consistency(known)
+    assert not any(frame(state, known, errors) for _ in range(100))
     assert all(marker.trusted for marker in known.values())
-
-
-def test_the_running_error_is_the_mean_at_first_and_then_forgets():
-    known = markers()
-    trust = Trust(known)
-    for error in (0.1, 0.3):
-        frame(trust, known, [error, 0.1])
-    of_both = np.sqrt((0.1**2 + 0.3**2) / 2.0)
-    np.testing.assert_allclose(trust.running_errors([known[0], known[1]]), [of_both, 0.1])
-    for _ in range(200):
-        frame(trust, known, [0.2, 0.1])
-    # 0.95^180 of the start is left.
-    np.testing.assert_allclose(trust.running_errors([known[0]]), [0.2], rtol=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -70,8 +57,8 @@ def test_of_two_that_contradict_each_other_the_better_known_one_holds(a, b, expe
 
 def test_a_marker_that_odometry_contradicts_is_quarantined_though_its_error_alone_is_no_evidence():
     known = markers(count=2)
-    trust = Trust(known)
-    changes = [frame(trust, known, [0.1, 0.3], left_out=[1]) for _ in range(24)]
+    state = Consistency(known)
+    changes = [frame(state, known, [0.1, 0.3], left_out=[1]) for _ in range(24)]
     assert changes.index(True) == 23
     assert known[0].trusted
     assert not known[1].trusted

@@ -1,0 +1,137 @@
+"""Systematic errors of the corners (lens, detector), learned from residuals that last."""
+
+import math
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+
+from thermal_fiducial.core.error_model import CHI2_OF_VIEW, INCONSISTENT_PX, SystematicErrors
+from thermal_fiducial.core.mapping.located import Location
+from thermal_fiducial.core.types import FloatArray, TINY
+
+#: Systematic errors of corners: weight of the prior in frames, and forgetting factor per frame, a memory of 300 frames.
+BIAS_PRIOR, BIAS_MEMORY = 5.0, 1.0 - 1.0 / 300.0
+#: Residuals of a marker beyond this many standard deviations of the bias count as so many.
+BIAS_OUTLIER = 2.0
+#: The same of the shape, as a variance in units of the noise: 99.9 % of markers with noise alone.
+LARGEST_SHAPE = CHI2_OF_VIEW / 8.0
+#: Part of the variance of independent corners that is left without their mean.
+SHAPE_VISIBLE = 0.75
+#: Fewest markers for the corner bias: the pose absorbs nearly all of the error of fewer.
+FEWEST_MARKERS = 3
+# Longest time between frames whose residuals are compared [ns]: later the corners are elsewhere in the image.
+_SUCCESSIVE_NS = 150_000_000
+
+
+class CornerBias:
+    """Systematic errors of the corners (lens, detector), from the correlation of residuals of successive frames.
+
+    White noise of two frames is independent, so the mean product of a corner's residuals in successive frames is the
+    variance of the systematic error, less the part that the pose absorbs: most of an error that is smooth over the
+    image, hardly any of errors that each corner has for itself. These the detector claims in the corners' noise
+    already; the rest is the bias. Without the mean over each marker's corners the product is that of the markers'
+    shapes. Errors of partially visible markers are correlated for other reasons; in the bias markers are weighted by
+    their claimed noise.
+    """
+
+    def __init__(self) -> None:
+        #: standard deviations: of the bias [px], and of the shapes as a share of the corners' noise
+        self.px, self.shape = SystematicErrors().corner_px, SystematicErrors().marker_shape
+        # Sums over frames: their number, the weights of their markers, shapes, what is known of corners' own errors,
+        # and what residuals show.
+        self._sums = np.zeros(9)
+        #: the last frame, and the weights (N,) of its markers
+        self._last: tuple[Location | None, FloatArray] = None, np.zeros(0)
+
+    def add(self, location: Location) -> None:
+        """Update with the residuals of a located frame."""
+        (last, before), noise = self._last, location.sight.noise_px
+        # Markers with more noise than the frame's median have less weight.
+        shares = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2)
+        self._last = location, shares
+        if last is None or not 0 < location.pose.stamp_ns - last.pose.stamp_ns < _SUCCESSIVE_NS:
+            return
+        places = {key: place for place, key in enumerate(last.pose.marker_ids)}
+        now = [place for place, key in enumerate(location.pose.marker_ids) if key in places]
+        then = [places[location.pose.marker_ids[place]] for place in now]
+        if len(now) < FEWEST_MARKERS:
+            return
+        residuals, former = location.seen.residuals[now], last.seen.residuals[then]
+        products = (residuals * former).sum(axis=(1, 2)) / 8.0
+        of_shape = products - (residuals.mean(axis=1) * former.mean(axis=1)).sum(axis=1) / 2.0
+        of_shape = np.clip(of_shape / (noise[now] * last.sight.noise_px[then]), -LARGEST_SHAPE, LARGEST_SHAPE)
+        shares = shares[now] * before[then]
+        # Residuals of moved or mistaken markers are correlated too.
+        limit = min(INCONSISTENT_PX, BIAS_OUTLIER * self.px) ** 2
+        bound = np.minimum(1.0, limit / np.maximum(np.abs(products), TINY))
+        corners = np.repeat(np.isin(np.arange(len(noise)), now), 4)
+        weights, scale = (np.repeat(np.sqrt(values), 4)[:, None] for values in (shares, shares * bound))
+        shown = shown_errors(
+            weights[..., None] * location.seen.J_camera[now].reshape(-1, 2, 6),
+            weights * location.correlations[corners][:, corners] * weights.T,
+            scale * residuals.reshape(-1, 2),
+            scale * former.reshape(-1, 2),
+        )
+        known = shown.own * float(shares @ location.sight.observed.detector_px[now] ** 2) / len(now)
+        sums = (1.0, shares.mean(), of_shape.mean() / SHAPE_VISIBLE, known, *shown)
+        self._sums = BIAS_MEMORY * self._sums + sums
+        frames, weight, shapes, known, *sums_shown = self._sums.tolist()
+        prior = SystematicErrors()
+        self.px = _learned(prior.corner_px, ShownErrors(*sums_shown).smooth_variance(known), weight)
+        # Not all that lasts until the next frame is alike in all views: the shape is never more than at first.
+        self.shape = min(_learned(prior.marker_shape, shapes / frames, frames), prior.marker_shape)
+
+
+def _learned(prior: float, variance: float, frames: float) -> float:
+    """Standard deviation by its prior and by the ``variance`` that a number of ``frames`` show."""
+    return math.sqrt((BIAS_PRIOR * prior**2 + frames * max(variance, 0.0)) / (BIAS_PRIOR + frames))
+
+
+class ShownErrors(NamedTuple):
+    """What residuals of a pose show of the corners' systematic errors: sums per coordinate.
+
+    If each corner has an error of its own, of variance s^2, and all share one that is smooth over the image, of
+    variance b^2, ``product`` is expected to be ``s^2 own + b^2 smooth`` and ``smooth_product``
+    ``s^2 smooth + b^2 both``
+    (minimum norm quadratic estimation of variance components; C. R. Rao, 1971).
+    """
+
+    #: product of successive residuals, and the same weighted by the correlations of the smooth error [px^2]
+    product: float
+    smooth_product: float
+    own: float
+    smooth: float
+    both: float
+
+    def smooth_variance(self, known: float) -> float:
+        """Variance b^2 [px^2], without errors of corners of their own as far as they are ``known`` in ``product``.
+
+        More of these than the detector knows of is taken for a sign of smooth errors: a lens model that is wrong within
+        a marker is worse over the whole image, where the pose hides it.
+        """
+        own = (self.product * self.both - self.smooth_product * self.smooth) / (self.own * self.both - self.smooth**2)
+        return (self.product - min(max(own, 0.0) * self.own, known)) / self.smooth
+
+
+def shown_errors(J: FloatArray, correlations: FloatArray, residuals: FloatArray, former: FloatArray) -> ShownErrors:
+    """What the residuals (n, 2) [px] of n corners and the ``former`` ones of the same corners show.
+
+    Parameters
+    ----------
+    J : (n, 2, 6) derivatives of the corners with respect to the pose
+    correlations : (n, n) of the smooth error
+    """
+    n = len(J)
+    # The pose takes up errors along six orthonormal directions.
+    directions = np.linalg.qr(J.reshape(2 * n, 6))[0]
+    correlated = (correlations @ directions.reshape(n, 12)).reshape(2 * n, 6)
+    taken_up = directions.T @ correlated
+    sums = (
+        np.vdot(residuals, former),
+        np.vdot(residuals, correlations @ former),
+        2.0 * n - 6.0,
+        2.0 * correlations.trace() - taken_up.trace(),
+        2.0 * np.vdot(correlations, correlations) - 2.0 * np.vdot(correlated, correlated) + np.vdot(taken_up, taken_up),
+    )
+    return ShownErrors(*(float(value) / (2.0 * n) for value in sums))
