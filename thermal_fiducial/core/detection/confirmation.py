@@ -151,50 +151,31 @@ def _confirmed(
     frame: Frame, found: FoundMarkers, markers: RefinedMarkers, decoder: Decoder, config: ArucoDetectorConfig
 ) -> BoolArray:
     """Which markers show their pattern at the refined corners."""
-    blur, observed, cells = markers.blur, markers.observed, decoder.cells
-    there = found.places.at.px + blur.shift
-    off = np.abs(observed.corners_px - there).max(axis=(1, 2))
-    read = off < _LITTLE / cells * se3.sides_px(found.places.at.px)
-    keep = (read & found.certain) | observed.by_pattern
+    corners = markers.observed.corners_px
+    there = found.places.at.px + markers.blur.shift
+    off_cells = np.abs(corners - there).max(axis=(1, 2)) * decoder.cells / se3.sides_px(there)
+    keep = ((off_cells < _LITTLE) & found.certain) | markers.observed.by_pattern
     others = np.flatnonzero(~keep)
     if len(others):
-        there, to_tails = there[others], None if blur.to_tails is None else blur.to_tails[others]
-        standing = np.sqrt(np.sum(blur.spread[others] ** 2, axis=1)) < _LITTLE * se3.sides_px(there) / cells
-        keep[others] = confirmed(
-            frame.image, to_tails, found.only(others), there, observed.only(others), decoder, config,
-            standing_picture=frame.displayed & standing,
-        )  # fmt: skip
-    return np.asarray(keep & frame.camera.contains(observed.corners_px, _BORDER_PX).all(axis=1))
+        near = found.expected[others] & (off_cells[others] < _NEAR_CELLS)
+        keep[others] = _readable(frame, markers.only(others), near, decoder, config)
+    return np.asarray(keep & frame.camera.contains(corners, _BORDER_PX).all(axis=1))
 
 
-def confirmed(
-    image: Float32Array,
-    to_tails: FloatArray | None,
-    found: FoundMarkers,
-    there: FloatArray,
-    refined: RefinedCorners,
-    decoder: Decoder,
-    config: ArucoDetectorConfig,
-    *,
-    standing_picture: BoolArray,
+def _readable(
+    frame: Frame, markers: RefinedMarkers, near: BoolArray, decoder: Decoder, config: ArucoDetectorConfig
 ) -> BoolArray:
-    """Which markers (N,) show their pattern at the refined corners.
-
-    Parameters
-    ----------
-    to_tails : (N, 2, 3) maps from pixels to lag tails, which are removed; None: none are
-    there : (N, 4, 2) predicted corners in the image [px]
-    standing_picture : (N,) which are in a picture for a display, without motion blur
-    """
+    """Which markers (N,) are decoded at the refined corners; expected ones ``near`` (N,) need less evidence."""
+    blur, corners = markers.blur, markers.observed.corners_px
     tails = None
-    if to_tails is not None:
-        tails = refined.corners_px @ to_tails[:, :, :2].swapaxes(1, 2) + to_tails[:, None, :, 2]
-    reading = _read(image, refined.corners_px, tails, decoder)
-    near = np.abs(refined.corners_px - there).max(axis=(1, 2)) < _NEAR_CELLS / decoder.cells * se3.sides_px(there)
-    known = found.expected & near & reading.clear(config.guided_min_correlation, config.guided_min_margin)
-    similar = np.abs(reading.correlation) >= np.where(standing_picture, _SIMILAR_IN_PICTURE, _SIMILAR)
+    if blur.to_tails is not None:
+        tails = corners @ blur.to_tails[:, :, :2].swapaxes(1, 2) + blur.to_tails[:, None, :, 2]
+    reading = _read(frame.image, corners, tails, decoder)
+    known = near & reading.clear(config.guided_min_correlation, config.guided_min_margin)
+    still = np.sqrt(np.sum(blur.spread**2, axis=1)) < _LITTLE / decoder.cells * se3.sides_px(corners)
+    similar = np.abs(reading.correlation) >= np.where(frame.displayed & still, _SIMILAR_IN_PICTURE, _SIMILAR)
     distinct = (similar | (decoder.correctable >= _MANY_BITS)) & _stands_out(reading, decoder)
-    return np.asarray((reading.ids == found.ids) & (known | distinct))
+    return np.asarray((reading.ids == markers.ids) & (known | distinct))
 
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:
