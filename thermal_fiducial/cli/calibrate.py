@@ -25,6 +25,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
 
 if TYPE_CHECKING:
@@ -94,7 +95,8 @@ def _camera_imu(args: argparse.Namespace) -> int:
         seen = sorted(_mapped_corners(frames, detector, marker_map, camera), key=lambda frame: frame.stamp_ns)
     if not seen:
         raise InputError(f'{args.bag}: no frame shows a marker of {args.map}, which are of {marker_map.dictionary}')
-    result = calibrate_rolling_camera_imu(seen, camera, imu, start_ns, noise)
+    with naming(args.bag):
+        result = calibrate_rolling_camera_imu(seen, camera, imu, start_ns, noise)
     write_text(args.out, _extrinsics_text(result))
     print(_extrinsics_text(result))
     _warn_of_wide(*_extrinsics_std(result))

@@ -10,6 +10,7 @@ from thermal_fiducial.calibration.sources import imu_track
 from thermal_fiducial.cli.subcommands import add_remap, file_to_write
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagReader, parse_remaps
+from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
 
 if TYPE_CHECKING:
@@ -38,7 +39,8 @@ def calibrate_imu(args: argparse.Namespace) -> int:
 
     with BagReader(args.bag, parse_remaps(args.remap)) as bag:
         track, _ = imu_track(bag)
-    fit = fit_noise(track)
+    with naming(args.bag):
+        fit = fit_noise(track)
     text = noise_text(fit)
     write_text(args.out, text)
     for name, sensor, unit in (('gyroscope', fit.gyroscope, 'rad/s'), ('accelerometer', fit.accelerometer, 'm/s^2')):

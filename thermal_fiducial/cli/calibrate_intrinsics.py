@@ -23,6 +23,7 @@ from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
 
 _SHADES = ' .:+#'
@@ -99,11 +100,12 @@ def _intrinsics(args: argparse.Namespace) -> int:
         raise InputError(f'--models are {", ".join(CANDIDATES)}; --focal-px and --every must be positive')
     views = _views(args)
     views.require(args.source)
-    result, fits = views.solve(models, args.focal_px)
-    if isinstance(views.target, MarkerBoard):
-        # The first search refined the corners without knowledge of the distortion.
-        views.look_again(result.camera)
+    with naming(args.source):
         result, fits = views.solve(models, args.focal_px)
+        if isinstance(views.target, MarkerBoard):
+            # The first search refined the corners without knowledge of the distortion.
+            views.look_again(result.camera)
+            result, fits = views.solve(models, args.focal_px)
     error = image_error(result.camera, result.covariance, [views.kept[k].sighting for k in result.views.tolist()])
     save_camera(args.out, result.camera)
     _save_covariance(args.out, result, error)

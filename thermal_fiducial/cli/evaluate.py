@@ -62,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
         return 0
     print_tables(tables(evaluation, numbers).values())
     print(f'ground truth: {evaluation.run.truth_path or "none, so no errors (--truth)"}')
+    if args.video:
+        print(f'video: {evaluation.run.path / VIDEO}')
     if page is not None:
         print(f'report: {page}')
     return 0

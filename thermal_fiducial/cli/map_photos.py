@@ -2,11 +2,9 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.config import ArucoDetectorConfig
@@ -17,6 +15,7 @@ from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import read_picture
+from thermal_fiducial.files.reading import naming
 
 _IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
 #: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.
@@ -35,13 +34,6 @@ def photos_in(folder: Path) -> list[Path]:
     return photos
 
 
-def _require_size_of(photo: Path, counts: npt.NDArray[Any], camera: Camera) -> None:
-    try:
-        camera.require_size_of(counts)
-    except InputError as error:
-        raise InputError(f'{photo}: {error}') from None
-
-
 def detect_in_photos(photos: list[Path], camera: Camera, args: argparse.Namespace) -> list[Markers]:
     """Markers of each photo.
 
@@ -56,7 +48,8 @@ def detect_in_photos(photos: list[Path], camera: Camera, args: argparse.Namespac
         for k, photo in enumerate(photos):
             progress(k / len(photos))
             counts = read_picture(photo, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-            _require_size_of(photo, counts, camera)
+            with naming(photo):
+                camera.require_size_of(counts)
             if counts.dtype == np.uint16:
                 frames.append(detector.detect(k * _APART_NS, counts.astype(np.uint16), camera))
             else:

@@ -139,7 +139,7 @@ def _view_table(distances: list[float], views: list[Expectation]) -> Table:
     )
     table = table_of(title, headers)
     for distance, view in zip(distances, views, strict=True):
-        verdict = f'{100 * view.found:.0f} %{"" if view.detected else ", no"}'
+        verdict = f'{100 * view.found:.0f} %{"" if view.detected else ", too few"}'
         numbers = ['-'] * 5
         if view.found > 0.0 and np.isfinite(view.position):
             errors = _two_digits(1e3 * view.position), _two_digits(1e3 * view.distance), f'{view.rotation_deg:.2g}'

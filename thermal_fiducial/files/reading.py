@@ -45,6 +45,15 @@ def shown(name: str | Path) -> str:
     return name if len(name) <= _LONGEST_NAME else f'{name[:_LONGEST_NAME]}...'
 
 
+@contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Let an InputError in this context begin with ``path``: what computes does not know where its input is from."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f'{shown(path)}: {error}') from None
+
+
 def require_regular(path: str | Path) -> None:
     """Raise InputError unless ``path`` is a readable regular file; reading a pipe or device might block forever."""
     with _opened(path, 1 << 63):

@@ -90,3 +90,11 @@ def test_the_command_writes_parameters(tmp_path, capsys):
 def test_what_is_no_rest_is_refused(change, words):
     with pytest.raises(ValueError, match=words):
         fit_noise(track(*change(*at_rest(60.0, ImuNoise(3e-3, 2e-2, 5e-5, 5e-4)))))
+
+
+def test_the_command_names_the_recording_that_it_refuses(tmp_path, capsys):
+    stamps = small_bag.START_NS + np.arange(200) * 5_000_000
+    events = [(stamp, IMU_TOPIC, small_bag.imu(stamp, np.zeros(6))) for stamp in stamps.tolist()]
+    bag = small_bag.Recording(events).write(tmp_path / 'bag')
+    assert main(['calibrate', 'imu', str(bag), '--out', str(tmp_path / 'imu.yaml')]) == 2
+    assert f'{bag}: 1.0 s are too short' in capsys.readouterr().err
