@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from shapely.geometry import LinearRing, Point, Polygon
 
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing
 
@@ -100,11 +100,6 @@ def _numbers(shape: Contour | Circle) -> FloatArray:
     if isinstance(shape, Circle):
         return np.array([shape.x, shape.y, shape.radius])
     return np.column_stack([shape.points, shape.bulges])
-
-
-def acrylic_at(drawing: Drawing, points: FloatArray) -> BoolArray:
-    """Whether points (N, 2) [mm] lie on acrylic; round holes are ignored."""
-    return np.asarray(shapely.contains(sheet_of(drawing), shapely.points(points)), dtype=np.bool_)
 
 
 def sheet_of(drawing: Drawing) -> Polygon:

@@ -3,7 +3,6 @@
 Limits are from the sources and documentation of mavros, PX4's EKF2 and ArduPilot's EKF3.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -57,112 +56,99 @@ def check_bridge(record: BridgeRecord) -> list[Finding]:
     if len(record.stamps_ns) < 2:
         text = 'mavros, PX4 and ArduPilot get nothing: is the filter initialised, does it see markers, is it lost?'
         return [Finding('messages', Level.FAULT, f'{len(record.stamps_ns)} messages', text)]
-    checks: tuple[Callable[[BridgeRecord], list[Finding]], ...] = (
-        _values,
-        _rate,
-        _stamps,
-        _age,
-        _names,
-        _gravity,
-        _yaw,
-        _velocity,
-        _covariance,
-        _jumps,
-    )
-    findings: list[Finding] = []
-    for check in checks:
-        findings += check(record)
-        if check is _values and findings[0].level is Level.FAULT:
-            break
-    return findings
+    values = _values(record)
+    if values.level is Level.FAULT:
+        return [values]
+    checks = _rate, _stamps, _age, _names, _gravity, _yaw, _velocity, _covariance, _jumps
+    return [values, *(check(record) for check in checks)]
 
 
-def _values(record: BridgeRecord) -> list[Finding]:
+def _values(record: BridgeRecord) -> Finding:
     arrays = (record.positions, record.quaternions, record.velocities, record.covariances)
     broken = sum(int((~np.isfinite(array.reshape(len(array), -1)).all(axis=1)).sum()) for array in arrays)
     norm = np.abs(np.linalg.norm(record.quaternions, axis=1) - 1.0).max()
     if broken:
-        return [Finding('values', Level.FAULT, f'{broken} not finite', 'PX4 takes NaN for "not measured".')]
+        return Finding('values', Level.FAULT, f'{broken} not finite', 'PX4 takes NaN for "not measured".')
     if norm > 1e-3:
-        return [Finding('values', Level.FAULT, f'quaternion off unit length by {norm:.3g}', 'Attitude is refused.')]
-    return [Finding('values', Level.OK, f'{len(record.stamps_ns)} messages, finite', '')]
+        return Finding('values', Level.FAULT, f'quaternion off unit length by {norm:.3g}', 'Attitude is refused.')
+    return Finding('values', Level.OK, f'{len(record.stamps_ns)} messages, finite', '')
 
 
-def _rate(record: BridgeRecord) -> list[Finding]:
+def _rate(record: BridgeRecord) -> Finding:
     steps = np.diff(np.sort(record.stamps_ns)) / SECOND_NS
     mean = float(steps.mean())
     rate, gap = (1.0 / mean if mean > 0.0 else 0.0), steps.max()
     seen = f'{rate:.1f} Hz, longest gap {gap * 1e3:.0f} ms'
     if rate < ARDUPILOT_RATE:
         text = 'PX4 never starts on it (needs 5 Hz), ArduPilot reports the source as unhealthy (needs 4 Hz).'
-        return [Finding('rate', Level.FAULT, seen, text)]
+        return Finding('rate', Level.FAULT, seen, text)
     if gap > PX4_STOP:
         text = 'PX4 stops using vision after 0.4 s without it and drifts; position modes may fail over to landing.'
-        return [Finding('rate', Level.FAULT, seen, text)]
+        return Finding('rate', Level.FAULT, seen, text)
     if gap > PX4_START:
         text = 'PX4 does not begin to use vision across gaps beyond 0.2 s.'
-        return [Finding('rate', Level.WARNING, seen, text)]
+        return Finding('rate', Level.WARNING, seen, text)
     if rate < PX4_RATE:
         text = 'PX4 recommends 30 to 50 Hz; ArduPilot is content.'
-        return [Finding('rate', Level.WARNING, seen, text)]
+        return Finding('rate', Level.WARNING, seen, text)
     if rate > TELEMETRY_RATE:
         text = 'More than a telemetry link carries; 30 to 50 Hz serve (bridge_rate).'
-        return [Finding('rate', Level.WARNING, seen, text)]
-    return [Finding('rate', Level.OK, seen, 'PX4 and ArduPilot use it.')]
+        return Finding('rate', Level.WARNING, seen, text)
+    return Finding('rate', Level.OK, seen, 'PX4 and ArduPilot use it.')
 
 
-def _stamps(record: BridgeRecord) -> list[Finding]:
+def _stamps(record: BridgeRecord) -> Finding:
     steps = np.diff(record.stamps_ns)
     repeated, backward = int((steps == 0).sum()), int((steps < 0).sum())
     if backward:
         text = 'EKF2 and EKF3 throw away what is older than what they have fused.'
-        return [Finding('stamps', Level.FAULT, f'{backward} go back', text)]
+        return Finding('stamps', Level.FAULT, f'{backward} go back', text)
     if repeated:
-        return [Finding('stamps', Level.WARNING, f'{repeated} repeated', 'mavros drops a message with an equal stamp.')]
-    return [Finding('stamps', Level.OK, 'strictly increasing', '')]
+        return Finding('stamps', Level.WARNING, f'{repeated} repeated', 'mavros drops a message with an equal stamp.')
+    return Finding('stamps', Level.OK, 'strictly increasing', '')
 
 
-def _age(record: BridgeRecord) -> list[Finding]:
+def _age(record: BridgeRecord) -> Finding:
     if not record.live:
-        return [Finding('age', Level.UNTESTED, 'recorded', 'Only a live check compares stamps with the clock.')]
+        return Finding('age', Level.UNTESTED, 'recorded', 'Only a live check compares stamps with the clock.')
     age = (record.arrivals_ns - record.stamps_ns) / SECOND_NS
     typical, worst = float(np.median(age)), float(np.percentile(age, 99))
     seen = f'{typical * 1e3:.1f} ms, 99 % below {worst * 1e3:.1f} ms'
     if typical < -0.002:
         text = 'Stamps lie in the future: the IMU driver has another clock. Synchronise, the autopilot cannot.'
-        return [Finding('age', Level.FAULT, seen, text)]
+        return Finding('age', Level.FAULT, seen, text)
     if worst > ARDUPILOT_DELAY:
         text = 'ArduPilot allows for 250 ms at most (VISO_DELAY_MS); PX4 fuses it at the wrong time.'
-        return [Finding('age', Level.FAULT, seen, text)]
+        return Finding('age', Level.FAULT, seen, text)
     text = f'Set EKF2_EV_DELAY (PX4) or VISO_DELAY_MS (ArduPilot) to {max(typical * 1e3, 0.0):.0f} plus the link.'
-    return [Finding('age', Level.OK, seen, text)]
+    return Finding('age', Level.OK, seen, text)
 
 
-def _names(record: BridgeRecord) -> list[Finding]:
+def _names(record: BridgeRecord) -> Finding:
     seen = ', '.join(f'{child or "?"} in {frame or "?"}' for frame, child in record.frames)
     if len(record.frames) > 1:
-        return [Finding('frame names', Level.FAULT, seen, 'Frames change within the stream.')]
+        return Finding('frame names', Level.FAULT, seen, 'Frames change within the stream.')
     frame, child = record.frames[0]
     if frame not in ('map', 'odom') or child != 'base_link':
         text = 'mavros looks up <frame>_ned and base_link_frd and, finding none, sends an uninitialised rotation.'
-        return [Finding('frame names', Level.FAULT, seen, text)]
-    return [Finding('frame names', Level.OK, seen, 'mavros converts it to NED and FRD by its own static transforms.')]
+        return Finding('frame names', Level.FAULT, seen, text)
+    return Finding('frame names', Level.OK, seen, 'mavros converts it to NED and FRD by its own static transforms.')
 
 
-def _gravity(record: BridgeRecord) -> list[Finding]:
+def _gravity(record: BridgeRecord) -> Finding:
     """Check that the specific force at rest points up, +z of an ENU map, at any attitude."""
     up = _specific_force_in_map(record)
     if up is None:
-        return [Finding('gravity', Level.UNTESTED, 'no IMU at rest', 'Let it listen to imu/data of a still drone.')]
+        return Finding('gravity', Level.UNTESTED, 'no IMU at rest', 'Let it listen to imu/data of a still drone.')
     tilt = float(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1.0, 1.0)))
     seen = f'specific force at rest {up[0]:+.2f} {up[1]:+.2f} {up[2]:+.2f} m/s^2 in the map'
     if tilt > np.radians(150.0):
         text = 'Upside down: map or body are NED/FRD here, mavros turns them once more and the drone flips.'
-        return [Finding('gravity', Level.FAULT, seen, text)]
+        return Finding('gravity', Level.FAULT, seen, text)
     if tilt > LARGEST_TILT:
         text = f'The vertical is off by {np.degrees(tilt):.1f} deg: the IMU is mounted otherwise, or the map tilts.'
-        return [Finding('gravity', Level.FAULT, seen, text)]
-    return [Finding('gravity', Level.OK, seen, f'Upright to {np.degrees(tilt):.1f} deg.')]
+        return Finding('gravity', Level.FAULT, seen, text)
+    return Finding('gravity', Level.OK, seen, f'Upright to {np.degrees(tilt):.1f} deg.')
 
 
 def _specific_force_in_map(record: BridgeRecord) -> FloatArray | None:
@@ -191,7 +177,7 @@ def _turns(record: BridgeRecord) -> tuple[FloatArray, FloatArray, BoolArray]:
     return turn, 0.5 * (record.rates[:-1] + record.rates[1:]), usable
 
 
-def _yaw(record: BridgeRecord) -> list[Finding]:
+def _yaw(record: BridgeRecord) -> Finding:
     """Check that yaw rates of pose and gyroscope have the same sign, positive to the left."""
     turn, rates, usable = _turns(record)
     if len(record.imu):
@@ -200,20 +186,18 @@ def _yaw(record: BridgeRecord) -> list[Finding]:
         gyroscope = rates[:, 2]
     turning = usable & (np.abs(gyroscope) > TURN)
     if turning.sum() < 10:
-        return [
-            Finding('yaw', Level.UNTESTED, 'no turn', 'Turn the drone about the vertical by hand while it listens.')
-        ]
+        return Finding('yaw', Level.UNTESTED, 'no turn', 'Turn the drone about the vertical by hand while it listens.')
     ratio = float(np.median(turn[turning, 2] / gyroscope[turning]))
     seen = f'the pose turns by {ratio:.2f} of what the gyroscope says'
     if ratio < 0.0:
         text = 'Opposite sense: one of them is NED/FRD. The autopilot would run away in yaw.'
-        return [Finding('yaw', Level.FAULT, seen, text)]
+        return Finding('yaw', Level.FAULT, seen, text)
     if abs(ratio - 1.0) > 0.1:
-        return [Finding('yaw', Level.FAULT, seen, 'Axes are mixed up: EKF2 and EKF3 refuse the heading.')]
-    return [Finding('yaw', Level.OK, seen, 'Same sense and size.')]
+        return Finding('yaw', Level.FAULT, seen, 'Axes are mixed up: EKF2 and EKF3 refuse the heading.')
+    return Finding('yaw', Level.OK, seen, 'Same sense and size.')
 
 
-def _velocity(record: BridgeRecord) -> list[Finding]:
+def _velocity(record: BridgeRecord) -> Finding:
     """Check that the twist in the robot's axes, integrated over half a second, equals the change of the position.
 
     Single intervals are too short: corrections by markers, of millimetres, are as large as the motion.
@@ -231,14 +215,14 @@ def _velocity(record: BridgeRecord) -> list[Finding]:
     )
     usable = (np.linalg.norm(velocity, axis=1) > MOVE) & (seconds[:, 0] < MOVE_SECONDS + PX4_START)
     if usable.sum() < 10:
-        return [Finding('velocity', Level.UNTESTED, 'no motion', 'Carry the drone about while it listens.')]
+        return Finding('velocity', Level.UNTESTED, 'no motion', 'Carry the drone about while it listens.')
     speed = float(np.median(np.linalg.norm(velocity[usable], axis=1)))
     wrong, swapped = (float(np.median(np.linalg.norm(velocity - v, axis=1)[usable])) for v in (as_robot, as_map))
     seen = f'differs from the moving position by {wrong:.2f} m/s at {speed:.2f} m/s'
     if wrong < max(0.25 * speed, 0.1):
-        return [Finding('velocity', Level.OK, seen, 'In the robot frame, as mavros and PX4 want it.')]
+        return Finding('velocity', Level.OK, seen, 'In the robot frame, as mavros and PX4 want it.')
     where = 'It is in the map frame instead.' if swapped < 0.5 * wrong else 'Its axes are wrong.'
-    return [Finding('velocity', Level.FAULT, seen, f'{where} mavros and PX4 take it for the robot frame.')]
+    return Finding('velocity', Level.FAULT, seen, f'{where} mavros and PX4 take it for the robot frame.')
 
 
 def _summed(t: FloatArray, velocity: FloatArray) -> FloatArray:
@@ -247,7 +231,7 @@ def _summed(t: FloatArray, velocity: FloatArray) -> FloatArray:
     return np.concatenate((np.zeros((1, 3)), np.cumsum(steps, axis=0)))
 
 
-def _covariance(record: BridgeRecord) -> list[Finding]:
+def _covariance(record: BridgeRecord) -> Finding:
     P = record.covariances
     lowest = np.linalg.eigvalsh(0.5 * (P + np.swapaxes(P, 1, 2)))[:, 0].min()
     diagonal = np.diagonal(P, axis1=1, axis2=2)
@@ -256,20 +240,20 @@ def _covariance(record: BridgeRecord) -> list[Finding]:
     seen = f'{position * 1e3:.1f} mm, {np.degrees(attitude):.3f} deg'
     if not diagonal.any():
         text = 'All zero: PX4 falls back on its parameters, ArduPilot too; nobody learns when the pose gets worse.'
-        return [Finding('covariance', Level.FAULT, seen, text)]
+        return Finding('covariance', Level.FAULT, seen, text)
     if lowest < -1e-9 or diagonal.min() <= 0.0:
-        return [Finding('covariance', Level.FAULT, seen, 'No covariance matrix: PX4 refuses variances up to zero.')]
+        return Finding('covariance', Level.FAULT, seen, 'No covariance matrix: PX4 refuses variances up to zero.')
     if stds.min() < MADE_UP:
         text = 'Too good to be true: unless floored, EKF2 follows each step of it.'
-        return [Finding('covariance', Level.WARNING, seen, text)]
+        return Finding('covariance', Level.WARNING, seen, text)
     text = (
         f'PX4 uses the larger of it and EKF2_EVP_NOISE ({PX4_FLOOR} m by default: lower it to profit), '
         f'ArduPilot of it and VISO_POS_M_NSE ({ARDUPILOT_FLOOR} m).'
     )
-    return [Finding('covariance', Level.OK, seen, text)]
+    return Finding('covariance', Level.OK, seen, text)
 
 
-def _jumps(record: BridgeRecord) -> list[Finding]:
+def _jumps(record: BridgeRecord) -> Finding:
     """Check for steps of the position beyond the speed."""
     dt = np.diff(record.stamps_ns) / SECOND_NS
     claimed = 0.5 * (record.velocities[:-1] + record.velocities[1:])
@@ -279,8 +263,8 @@ def _jumps(record: BridgeRecord) -> list[Finding]:
     seen = f'largest {worst * 1e3:.0f} mm'
     if worst > 5.0 * PX4_FLOOR:
         text = 'Beyond the 5 sigma gate of EKF2: vision is refused for a second, then the position is reset to it.'
-        return [Finding('jumps', Level.FAULT, seen, text + ' mavros cannot announce it (no reset counter), DDS does.')]
+        return Finding('jumps', Level.FAULT, seen, text + ' mavros cannot announce it (no reset counter), DDS does.')
     if worst > 0.05:
         text = 'The controller sees a step; smoothing_time spreads it.'
-        return [Finding('jumps', Level.WARNING, seen, text)]
-    return [Finding('jumps', Level.OK, seen, '')]
+        return Finding('jumps', Level.WARNING, seen, text)
+    return Finding('jumps', Level.OK, seen, '')

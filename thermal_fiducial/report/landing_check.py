@@ -25,7 +25,7 @@ def check_landing(robot: BridgeRecord) -> list[Finding]:
     if len(record.frames) != 1:
         seen = ' and '.join(record.frames)
         return [Finding('landing target', Level.FAULT, seen, 'Two nodes send one; only one may.')]
-    return [_rate(record), *_place(record, robot)]
+    return [_rate(record), _place(record, robot)]
 
 
 def _rate(record: LandingRecord) -> Finding:
@@ -37,11 +37,11 @@ def _rate(record: LandingRecord) -> Finding:
     return Finding('landing target rate', Level.OK, f'{1.0 / float(np.median(gaps)):.0f} Hz', '')
 
 
-def _place(record: LandingRecord, robot: BridgeRecord) -> list[Finding]:
+def _place(record: LandingRecord, robot: BridgeRecord) -> Finding:
     """Check that the target is below the robot and static in the map."""
     nearest, near = _nearest(record.stamps_ns, robot.stamps_ns)
     if not near.any():
-        return [Finding('landing target', Level.UNTESTED, 'no odometry beside it', 'Its place is not compared.')]
+        return Finding('landing target', Level.UNTESTED, 'no odometry beside it', 'Its place is not compared.')
     robots = robot.positions[nearest[near]]
     given = record.positions[near]
     in_map = record.frames[0] == 'map'
@@ -55,15 +55,15 @@ def _place(record: LandingRecord, robot: BridgeRecord) -> list[Finding]:
     seen = f'{kind}, {below:.2f} m below, wanders by {wanders * 1e3:.0f} mm'
     if below < 0.0:
         text = 'The pad is above the drone: mav_frame, camera_orientation or the order of the axes is wrong.'
-        return [Finding('landing target', Level.FAULT, seen, text)]
+        return Finding('landing target', Level.FAULT, seen, text)
     if wanders > WRONG:
         text = 'It follows the drone: axes are swapped, or camera_position and camera_orientation are wrong.'
-        return [Finding('landing target', Level.FAULT, seen, text)]
+        return Finding('landing target', Level.FAULT, seen, text)
     if wanders > WANDERS:
-        return [Finding('landing target', Level.WARNING, seen, 'A pad that lies still seems to move: calibrate.')]
+        return Finding('landing target', Level.WARNING, seen, 'A pad that lies still seems to move: calibrate.')
     if not in_map and moved < WANDERS:
-        return [Finding('landing target', Level.UNTESTED, seen, 'Move the drone above the pad while it listens.')]
-    return [Finding('landing target', Level.OK, seen, '')]
+        return Finding('landing target', Level.UNTESTED, seen, 'Move the drone above the pad while it listens.')
+    return Finding('landing target', Level.OK, seen, '')
 
 
 def _nearest(stamps_ns: IntArray, of_ns: IntArray) -> tuple[IntArray, BoolArray]:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import shapely
 from support.boards import render
 
 from thermal_fiducial.config import ArucoDetectorConfig
@@ -11,7 +12,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px
 from thermal_fiducial.fabrication.bridges import find_bridges
 from thermal_fiducial.fabrication.plate import marker_drawing, pattern_origin, PlateOptions
-from thermal_fiducial.fabrication.verification import acrylic_at
+from thermal_fiducial.fabrication.verification import sheet_of
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.scenario import LENSES
 
@@ -27,7 +28,7 @@ def raster(drawing, origin):
     count = round(0.5 * (drawing.width + 2.0 * border))
     x = 2.0 * (np.arange(count) + 0.5) - border
     u, v = np.meshgrid(x, x[::-1])
-    acrylic = acrylic_at(drawing, np.stack([u.ravel(), v.ravel()], axis=1)).reshape(count, count)
+    acrylic = shapely.contains_xy(sheet_of(drawing), u, v)
     for hole in drawing.holes:
         acrylic &= np.hypot(u - hole.x, v - hole.y) > hole.radius
     return ~acrylic, 2e-3 * count

@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import cv2
 import numpy as np
 import pytest
+import shapely
 from shapely import affinity
 from shapely.geometry import box, Point, Polygon
 from shapely.ops import unary_union
@@ -21,7 +22,7 @@ from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing
 from thermal_fiducial.fabrication.paper import tiling
 from thermal_fiducial.fabrication.plate import marker_drawing, pattern_origin, PlateOptions
 from thermal_fiducial.fabrication.sheet import nest
-from thermal_fiducial.fabrication.verification import acrylic_at, agree, problems, read_dxf
+from thermal_fiducial.fabrication.verification import agree, problems, read_dxf, sheet_of
 from thermal_fiducial.fabrication.writers import write
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map
@@ -85,7 +86,7 @@ def test_every_drawing_is_sound(dictionary, mount):
         cell = options.size / (len(bits) + 2)
         middle = pattern_origin(options, len(bits) + 2) + cell * (np.argwhere(bits >= 0)[:, ::-1] + 1.5)
         middle[:, 1] = drawing.height - middle[:, 1]
-        assert np.array_equal(acrylic_at(drawing, middle), bits.reshape(-1) == 0)
+        assert np.array_equal(shapely.contains_xy(sheet_of(drawing), middle), bits.reshape(-1) == 0)
 
 
 def test_corner_radius_rounds_only_where_cracks_start():
