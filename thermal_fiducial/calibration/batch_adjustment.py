@@ -5,26 +5,19 @@ shared unknowns.
 """
 
 from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from thermal_fiducial.calibration.banded_equations import BandedEquations
-from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, Increments, preintegrate
+from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, preintegrate
+from thermal_fiducial.calibration.rig_state import horizontal, imu_errors, OF_ALL, OF_FRAME, State
 from thermal_fiducial.calibration.rolling import RowMoments
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.types import FloatArray, IntArray
-from thermal_fiducial.errors import InputError
 
-_STATE = 15
-#: Shared unknowns: rotation and position of the camera in the body, time offset, direction of gravity, read-out time,
-#: scale errors and misalignments of the IMU.
-_SHARED = 10 + AXES
-#: Largest time offset that is searched [s].
-LARGEST_OFFSET = 0.15
-_COARSE_STEP = 0.002
 _MAX_STEPS = 15
 # Convergence threshold of the shared unknowns [rad, m, s], below the printed digits.
 _CONVERGED = 1e-7
@@ -38,22 +31,6 @@ _BIAS_PRIOR = np.array([0.1] * 3 + [1.0] * 3)
 _AXES_PRIOR = np.where(np.isin(np.arange(AXES), (0, 4, 8, 9, 11, 14)), 0.01, 0.005)
 # Standard deviation of the read-out time about zero: while it is estimated, and while it is held there [s].
 _READOUT_PRIOR, _READOUT_HELD = 0.05, 1e-12
-
-
-@dataclass(frozen=True)
-class State:
-    """All unknowns; those of each frame have a leading dimension (N,)."""
-
-    R: FloatArray
-    p: FloatArray
-    v: FloatArray
-    bias: FloatArray
-    R_body_camera: FloatArray
-    p_body_camera: FloatArray
-    offset: float
-    gravity: FloatArray
-    readout: float = 0.0
-    axes: FloatArray = field(default_factory=lambda: np.zeros(AXES))
 
 
 @dataclass(frozen=True)
@@ -80,35 +57,6 @@ def root_information(covariance: FloatArray) -> FloatArray:
     """W (6, 6) with W^T W the inverse of ``covariance``."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray((vectors / np.sqrt(np.maximum(values, 1e-14))).T)
-
-
-def first_state(stamps: FloatArray, measured: FloatArray, imu: ImuTrack, gravity: float) -> State:
-    """Initial state: clock offset and rotation by matching angular velocities, everything else from these."""
-    R, p = measured[:, :3, :3], measured[:, :3, 3]
-    dt = np.diff(stamps)
-    turned = se3.so3_log(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / dt[:, None]
-    steady = dt < 2.0 * np.median(dt)
-    middle = 0.5 * (stamps[:-1] + stamps[1:])[steady]
-    turned = turned[steady]
-    if np.min(np.std(turned, axis=0)) < 0.01:
-        raise InputError('the camera turned about fewer than three axes: neither rotation nor lever arm show in that')
-    offsets = np.arange(-LARGEST_OFFSET, LARGEST_OFFSET, _COARSE_STEP)
-    aligned = [_aligned(turned, imu.at(middle + offset)[0]) for offset in offsets]
-    best = int(np.argmin([error for _, _, error in aligned]))
-    R_body_camera, rate_bias, _ = aligned[best]
-    R_body = R @ R_body_camera.T
-    _, force = imu.at(stamps + offsets[best])
-    up = np.mean((R_body @ force[:, :, None])[:, :, 0], axis=0)
-    bias = np.tile(np.concatenate([rate_bias, np.zeros(3)]), (len(stamps), 1))
-    v = np.gradient(p, stamps, axis=0)
-    down = -gravity * up / np.linalg.norm(up)
-    return State(R_body, p.copy(), v, bias, R_body_camera, np.zeros(3), float(offsets[best]), down)
-
-
-def _aligned(camera: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """R, b and mean squared error of body = R camera + b."""
-    T = se3.rigid_alignment(body, camera)
-    return T[:3, :3], T[:3, 3], float(np.mean((body - se3.apply(T, camera)) ** 2))
 
 
 class Problem:
@@ -205,14 +153,14 @@ class Problem:
 
     def _of_samples(self, state: State) -> BandedEquations:
         """Normal equations of IMU samples and priors."""
-        normal = BandedEquations.empty(len(self._stamps), _STATE, _SHARED)
+        normal = BandedEquations.empty(len(self._stamps), OF_FRAME, OF_ALL)
         self._add_imu(state, normal)
         normal.H[0, 0, 9:, 9:] += np.diag(1.0 / _BIAS_PRIOR**2)
         normal.g[0, 9:] += state.bias[0] / _BIAS_PRIOR**2
         prior = _READOUT_HELD if self._rows is None else _READOUT_PRIOR
         normal.C[9, 9] += 1.0 / prior**2
         normal.c[9] += state.readout / prior**2
-        normal.C[range(10, _SHARED), range(10, _SHARED)] += 1.0 / _AXES_PRIOR**2
+        normal.C[range(10, OF_ALL), range(10, OF_ALL)] += 1.0 / _AXES_PRIOR**2
         normal.c[10:] += state.axes / _AXES_PRIOR**2
         return normal
 
@@ -226,7 +174,7 @@ class Problem:
         error = np.zeros((count, 6))
         error[:, :3] = state.p + state.R @ arm - self._measured[:, :3, 3]
         error[:, 3:] = se3.so3_log(R @ np.swapaxes(self._measured[:, :3, :3], 1, 2))
-        own, shared = np.zeros((count, 6, _STATE)), np.zeros((count, 6, _SHARED))
+        own, shared = np.zeros((count, 6, OF_FRAME)), np.zeros((count, 6, OF_ALL))
         own[:, :3, :3] = np.eye(3)
         own[:, :3, 3:6] = -state.R @ se3.skew(arm)
         own[:, 3:, 3:6] = state.R
@@ -294,7 +242,7 @@ class Problem:
             bias=state.bias + own[:, 9:],
             R_body_camera=state.R_body_camera @ se3.so3_exp(shared[:3]),
             p_body_camera=state.p_body_camera + shared[3:6],
-            gravity=se3.so3_exp(_horizontal(state.gravity) @ shared[7:9]) @ state.gravity,
+            gravity=se3.so3_exp(horizontal(state.gravity) @ shared[7:9]) @ state.gravity,
             readout=state.readout + shared[9],
             axes=state.axes + shared[10:],
         )
@@ -311,44 +259,3 @@ class Problem:
             p=state.p + state.v * delay + 0.5 * acceleration * delay**2,
             v=state.v + acceleration * delay,
         )
-
-
-def _horizontal(gravity: FloatArray) -> FloatArray:
-    """Axes (3, 2) about which the direction of gravity can turn."""
-    _, _, Vt = np.linalg.svd(gravity[None])
-    return np.asarray(Vt[1:].T)
-
-
-def imu_errors(
-    state: State, increments: Increments, noise: ImuNoise
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Whitened errors (K, 15) of consecutive states, and derivatives by the first, the second and the shared ones."""
-    count = len(increments.dt)
-    dt = increments.dt[:, None]
-    R0, R1 = state.R[:-1], state.R[1:]
-    R0t = np.swapaxes(R0, 1, 2)
-    gravity = state.gravity
-    dv = (R0t @ (state.v[1:] - state.v[:-1] - gravity * dt)[:, :, None])[:, :, 0]
-    dp = (R0t @ (state.p[1:] - state.p[:-1] - state.v[:-1] * dt - 0.5 * gravity * dt**2)[:, :, None])[:, :, 0]
-    turn = se3.so3_log(np.swapaxes(increments.R, 1, 2) @ R0t @ R1)
-    error = np.concatenate([turn, dv - increments.v, dp - increments.p, state.bias[1:] - state.bias[:-1]], axis=1)
-    first, second = np.zeros((count, _STATE, _STATE)), np.zeros((count, _STATE, _STATE))
-    shared = np.zeros((count, _STATE, _SHARED))
-    # log(D^T R0^T R1 exp(d)) = turn + Jr^-1 d, and Jr^-1 is the transpose of Jl^-1.
-    by_turn = np.swapaxes(se3.so3_left_jacobian_inverse(turn), 1, 2)
-    first[:, :3, 3:6] = -by_turn @ np.swapaxes(R1, 1, 2) @ R0
-    second[:, :3, 3:6] = by_turn
-    first[:, 3:6, 3:6], first[:, 3:6, 6:9], second[:, 3:6, 6:9] = se3.skew(dv), -R0t, R0t
-    first[:, 6:9, 3:6], first[:, 6:9, :3], second[:, 6:9, :3] = se3.skew(dp), -R0t, R0t
-    first[:, 6:9, 6:9] = -R0t * dt[:, :, None]
-    first[:, :9, 9:] = -increments.by_bias
-    first[:, 9:, 9:], second[:, 9:, 9:] = -np.eye(6), np.eye(6)
-    by_gravity = -se3.skew(gravity) @ _horizontal(gravity)
-    shared[:, :9, 10:] = -increments.by_axes
-    shared[:, 3:6, 7:9] = -R0t @ by_gravity * dt[:, :, None]
-    shared[:, 6:9, 7:9] = -0.5 * R0t @ by_gravity * dt[:, :, None] ** 2
-    root = np.zeros((count, _STATE, _STATE))
-    root[:, :9, :9] = np.linalg.inv(np.linalg.cholesky(increments.covariance + 1e-18 * np.eye(9)))
-    walk = np.array([max(noise.gyroscope_random_walk, 1e-9)] * 3 + [max(noise.accelerometer_random_walk, 1e-9)] * 3)
-    root[:, 9:, 9:] = (1.0 / (walk * np.sqrt(dt)))[:, :, None] * np.eye(6)
-    return (root @ error[:, :, None])[:, :, 0], root @ first, root @ second, root @ shared

@@ -14,15 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.calibration.batch_adjustment import (
-    first_state,
-    LARGEST_OFFSET,
-    Problem,
-    root_information,
-    Solution,
-    State,
-)
+from thermal_fiducial.calibration.batch_adjustment import Problem, root_information, Solution
 from thermal_fiducial.calibration.preintegration import AXES, ImuTrack
+from thermal_fiducial.calibration.rig_state import first_state, LARGEST_OFFSET, State
 from thermal_fiducial.calibration.rolling import FrameCorners, RowMoments, SolvedFrame
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.geometry import se3

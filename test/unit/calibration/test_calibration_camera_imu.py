@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from support.scenes import camera_of
 
-from thermal_fiducial.calibration.batch_adjustment import first_state, imu_errors, Problem
+from thermal_fiducial.calibration.batch_adjustment import Problem
 from thermal_fiducial.calibration.camera_imu import calibrate_camera_imu, calibrate_rolling_camera_imu
 from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, preintegrate
+from thermal_fiducial.calibration.rig_state import first_state, imu_errors
 from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.geometry import se3
