@@ -4,7 +4,7 @@ A marker is confirmed by the correlation of its pattern. A gain control for disp
 counts. The middle between the gray levels of black and white is then not the middle of the blurred step between them:
 all dark regions grow, or all shrink. The sides of a marker and the inner edges of its border move in opposite
 directions, so the width of the border measures the displacement. Markers whose cells are hardly wider than the blur are
-refined by fitting the whole pattern, as single sides cannot be measured, and confirmed by the evidence of that fit.
+refined by fitting the whole pattern, and confirmed by the evidence of that fit or by their pattern like the others.
 """
 
 from dataclasses import replace
@@ -154,7 +154,7 @@ def _confirmed(
     corners = markers.observed.corners_px
     there = found.places.at.px + markers.blur.shift
     off_cells = np.abs(corners - there).max(axis=(1, 2)) * decoder.cells / se3.sides_px(there)
-    keep = ((off_cells < _LITTLE) & found.certain) | markers.observed.by_pattern
+    keep = ((off_cells < _LITTLE) & found.certain) | markers.observed.evident
     others = np.flatnonzero(~keep)
     if len(others):
         near = found.expected[others] & (off_cells[others] < _NEAR_CELLS)

@@ -14,9 +14,12 @@ OF_SIDES_PX = 0.010
 OF_ALL_SIDES_PX = 0.005
 #: A corner by ``cornerSubPix`` on thermal frames [px]: blur rounds it.
 OF_LOCAL_PX = 0.18
-#: A corner by the whole pattern of a small marker in a picture for a display [px]: gray levels there are a nonlinear
-#: function of the counts, and sheets are bent. Photos of a room and of a carpet, against the same at full resolution.
-OF_PATTERN_PX = 0.05
+#: A corner by the whole pattern of a small marker [px]: the blur of the optics is not quite a Gaussian. Rendered frames
+#: without noise.
+OF_PATTERN_PX = 0.006
+#: The same in a picture for a display [px]: gray levels there are a nonlinear function of the counts, and sheets are
+#: bent. Photos of a room and of a carpet, against the same at full resolution.
+OF_DISPLAYED_PATTERN_PX = 0.05
 #: A side in a picture for a display, a nonlinear function of the counts [px]: if its middle gray lies anywhere between
 #: a fifth and four fifths of the original step, a step blurred by 0.66 px is displaced by up to 0.55, evenly spread.
 OF_BENT_SCALE_PX = 0.3

@@ -20,6 +20,7 @@ class RefinedCorners(Stacked):
     doubt : (N,) additional variance where the outline is inconsistent with a square, or has not converged, else 0;
         not in covariances [px^2]
     by_pattern : (N,) whether their whole pattern was fitted
+    evident : (N,) whether that fit is evidence enough of the marker
     """
 
     corners_px: FloatArray
@@ -28,9 +29,10 @@ class RefinedCorners(Stacked):
     noise: FloatArray
     doubt: FloatArray
     by_pattern: BoolArray
+    evident: BoolArray
 
     @staticmethod
     def none() -> 'RefinedCorners':
         """No corners."""
-        no = np.zeros(0)
-        return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no, no.astype(bool))
+        no, none = np.zeros(0), np.zeros(0, dtype=bool)
+        return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no, none, none)

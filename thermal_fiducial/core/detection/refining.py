@@ -44,6 +44,7 @@ from thermal_fiducial.core.detection.frame import (
     WITHOUT_TAIL,
 )
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
+from thermal_fiducial.core.detection.blurred_patterns import PatternView
 from thermal_fiducial.core.detection.pattern_fit import fitted_patterns, too_small_for_sides
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refined_corners import RefinedCorners
@@ -146,12 +147,19 @@ def refine(
     for _ in range(_ROUNDS):
         blur = _motion_blur(frame, places, twist)
         start = places.at.at_pixels(places.at.px + blur.shift)
-        seen = refine_corners(frame.image, start, frame.camera, behind, config.blur_px, columns, narrow, blur)
-        if frame.displayed:
-            # Lag tails stay in small markers.
-            small, fitted = fitted_patterns(frame, found, start.px + blur.removed, decoder, config.blur_px)
-            fitted = replace(fitted, corners_px=fitted.corners_px - blur.removed[small])
-            seen = seen.with_others(small, fitted)
+        small = too_small_for_sides(start.px, decoder.cells, config.blur_px)
+        sides, patterns = np.flatnonzero(~small), np.flatnonzero(small)
+        seen = RefinedCorners.none()
+        if len(sides):
+            seen = refine_corners(
+                frame.image, start.only(sides), frame.camera, behind[sides], config.blur_px, columns, narrow,
+                blur.only(sides),
+            )  # fmt: skip
+        if len(patterns):
+            moving = blur.only(patterns)
+            view = PatternView(frame.image, moving.to_tails, moving.spread)
+            fitted = fitted_patterns(frame, found.only(patterns), start.only(patterns), view, decoder, config.blur_px)
+            seen = seen.joined(fitted).only(np.argsort(np.concatenate([sides, patterns])))
         markers = _at_stamp(frame, found.ids, places, blur, seen, twist, track, behind.shape[2])
         change = np.abs(markers.corners.corners_px - seen.corners_px + blur.shift)
         if markers.twist is None or change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX:
@@ -182,8 +190,8 @@ def _at_stamp(
     if frame.twist is not None or known is None:
         sure = np.ones(len(ids), dtype=bool)
         if frame.displayed:
-            # Sides of small markers may be those of other things.
-            sure = seen.by_pattern | ~too_small_for_sides(places.at.px, cells)
+            # What looks like a small marker may be another thing.
+            sure = seen.evident | ~seen.by_pattern
         twist = track.correct(frame.stamp_ns, frame.twist, ids[sure], at.x[sure], places.depth[sure], deviation[sure])
     if twist is None:
         unsure = doubted + _of_unpredicted_motion(frame, places, seen, UNKNOWN_TWIST, cells)
@@ -310,5 +318,5 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     # More passes would not make corners better that are displaced by their own contrast.
     uneven = OF_UNEVEN_CONTRAST_PX * segments.slope_of_contrast() / np.maximum(np.abs(contrast), TINY)
     covariances = covariances + (uneven * uneven)[:, None, None, None] * _EYE
-    by_sides = np.zeros(len(doubt), dtype=bool)
-    return RefinedCorners(corners, covariances, contrast, noise, doubt, by_sides), np.flatnonzero(moving)
+    no = np.zeros(len(doubt), dtype=bool)
+    return RefinedCorners(corners, covariances, contrast, noise, doubt, no, no), np.flatnonzero(moving)

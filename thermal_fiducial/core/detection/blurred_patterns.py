@@ -1,0 +1,222 @@
+"""Model of a marker's whole pattern as the camera shows it, and its residuals in an image.
+
+A pattern is sampled on a grid in the marker's own coordinates [cells], where cells are separable: the blur of its
+columns and that of its rows are products. A blur that is oblique there, as that of a tilted marker and of motion, has a
+correlation c besides, and a Gaussian with it is exp(c d2/dxdy) of one without.
+
+All that is linear is part of the model. The warm surface and the sheet before it each have a temperature that is linear
+across the marker, so level and contrast are. The surface may end one cell outside the marker.
+"""
+
+from functools import cache
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core.detection.frame import without_tails, WITHOUT_TAIL
+from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
+from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
+
+#: How far samples reach beyond the sides [cells].
+_RING = 0.5
+# Place of the end of the warm surface outside the sides [cells].
+_SURFACE_ENDS = 1.0
+# Cumulative standard normal distribution, by a table.
+_Z = np.linspace(-6.0, 6.0, 2401)
+_BELOW = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z.tolist()])
+
+
+class PatternGrid(NamedTuple):
+    """Samples of a marker with m x m cells, S along each axis, P = S * S."""
+
+    #: (S,) [cells]
+    along: FloatArray
+    #: (4, P) of :func:`bilinear`
+    weights: Float32Array
+    #: (P, 3 or 6) orthonormal backgrounds
+    background: FloatArray
+    #: (2, P) places from the middle, in sides
+    middle: FloatArray
+    #: samples of a cell
+    density: int
+    #: whether contrast is linear across the marker, else constant
+    graded: bool
+
+    def without_background(self, values: FloatArray) -> FloatArray:
+        """Values (..., P) at the samples without their background."""
+        return np.asarray(values - (values @ self.background) @ self.background.T)
+
+
+@cache
+def pattern_grid(cells: int, density: int, *, bent: bool = False) -> PatternGrid:
+    """Grid with so many samples along a cell.
+
+    The background is linear, and so is the contrast; if ``bent`` the background is quadratic, the contrast constant.
+    """
+    along = (np.arange(round(density * (cells + 2.0 * _RING))) + 0.5) / density - _RING
+    a, b = (axis.ravel() / cells for axis in np.meshgrid(along, along))
+    linear = [np.ones_like(a), a, b]
+    background = np.linalg.qr(np.stack([*linear, a * a, a * b, b * b] if bent else linear, axis=1))[0]
+    weights = bilinear(a, b).astype(np.float32)
+    return PatternGrid(along, weights, background, np.stack([a, b]) - 0.5, density, graded=not bent)
+
+
+class PatternView(NamedTuple):
+    """Image of Q markers, and the motion in it."""
+
+    image: Float32Array
+    #: (Q, 2, 3) maps from pixels to lag tails, which are removed; None: none are
+    to_tails: FloatArray | None = None
+    #: (Q, 2) standard deviation of the motion blur, along the motion [px]; None: no motion
+    motion: FloatArray | None = None
+
+    def gray(self, quads: FloatArray, grid: PatternGrid) -> FloatArray:
+        """Values (Q, P) at the samples of markers in ``quads`` (Q, 4, 2)."""
+        places = seen_between(quads, grid.weights)
+        shown = self._at(places)
+        if self.to_tails is not None:
+            maps = self.to_tails.transpose(1, 2, 0)[..., None].astype(np.float32)
+            tails = maps[:, 0] * places[0] + maps[:, 1] * places[1] + maps[:, 2]
+            shown = without_tails(shown, self._at(tails))
+        return np.asarray(shown, dtype=np.float64)
+
+    def _at(self, places: Float32Array) -> Float32Array:
+        shown = cv2.remap(self.image, places[0], places[1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(shown, dtype=np.float32)
+
+
+class CellWeights(NamedTuple):
+    """Weights (Q, S, m) of cells at samples along an axis, and their first and second derivatives by place."""
+
+    value: FloatArray
+    slope: FloatArray
+    curvature: FloatArray
+
+
+class PatternModel(NamedTuple):
+    """Blurred patterns of Q markers, (Q, P) each."""
+
+    value: FloatArray
+    #: (2, Q, P) derivatives along columns and rows [1/cell]
+    slopes: FloatArray
+    #: derivative by the blur [1/px]
+    wider: FloatArray
+
+
+class PatternResiduals(NamedTuple):
+    """Q markers at their corners: how pixels differ from patterns, and what would change that."""
+
+    corners_px: FloatArray
+    #: (Q,) [px]
+    blur: FloatArray
+    #: (Q, 2, 2) derivatives of places in the marker [cells] by pixels
+    to_cells: FloatArray
+    #: of cells along rows and along columns
+    x: CellWeights
+    y: CellWeights
+    #: (Q, P) gray levels, and these without the pattern; no background in either
+    seen: FloatArray
+    rest: FloatArray
+    #: (Q,)
+    contrast: FloatArray
+    #: (Q, 9 + L, P) derivatives by the corners' u and v, by blur, and by the L linear terms
+    J: FloatArray
+    grid: PatternGrid
+
+    @property
+    def pixels(self) -> FloatArray:
+        """Pixels (Q,) that the samples cover."""
+        return np.asarray(self.seen.shape[1] / self.grid.density**2 / np.abs(np.linalg.det(self.to_cells)))
+
+
+def linearised(
+    view: PatternView, quads: FloatArray, blur: FloatArray, white: FloatArray, grid: PatternGrid
+) -> PatternResiduals:
+    """The fit of ``white`` cells (Q, m, m), seen with ``blur`` (Q,) [px], at corners ``quads`` (Q, 4, 2)."""
+    count, cells = white.shape[:2]
+    to_cells = _to_cells(quads, cells)
+    of_optics = to_cells @ to_cells.swapaxes(1, 2)
+    spread = (blur * blur)[:, None, None] * of_optics
+    if view.motion is not None:
+        moved = to_cells @ view.motion[..., None]
+        spread = spread + moved @ moved.swapaxes(1, 2)
+    x, y = (_weights(grid.along, cells, np.sqrt(spread[:, axis, axis])) for axis in (0, 1))
+    model = _model(x, y, white, spread, blur, of_optics)
+    seen = grid.without_background(view.gray(quads, grid))
+    terms = grid.without_background(_linear_terms(model, spread, grid, cells))
+    amounts = np.linalg.solve(
+        terms @ terms.swapaxes(1, 2) + TINY * np.eye(terms.shape[1]), terms @ seen[..., None]
+    )[..., 0]
+    contrast = amounts[:, :1]
+    if grid.graded:
+        contrast = contrast + amounts[:, 1:3] @ grid.middle
+    by_px = to_cells.swapaxes(1, 2) @ (model.slopes * contrast).swapaxes(0, 1)
+    J = np.empty((count, 9 + terms.shape[1], seen.shape[1]))
+    J[:, :8] = (by_px[:, :, None] * grid.weights).reshape(count, 8, -1)
+    J[:, 8], J[:, 9:] = -contrast * model.wider, -terms
+    J[:, :9] = grid.without_background(J[:, :9])
+    rest = seen - (amounts[:, None] @ terms)[:, 0]
+    return PatternResiduals(quads, blur, to_cells, x, y, seen, rest, amounts[:, 0], J, grid)
+
+
+def _model(
+    x: CellWeights, y: CellWeights, white: FloatArray, spread: FloatArray, blur: FloatArray, of_optics: FloatArray
+) -> PatternModel:
+    """Patterns, 0 for white and -1 for black, with a blur of covariance ``spread`` (Q, 2, 2) [cells^2].
+
+    ``of_optics`` (Q, 2, 2): its derivative by the variance of the optics.
+    """
+    black = white - 1.0
+
+    def shown(down: FloatArray, across: FloatArray) -> FloatArray:
+        return np.asarray((down @ black @ across.swapaxes(1, 2)).reshape(len(black), -1))
+
+    c = spread[:, :1, 1]
+    twisted = shown(y.slope, x.slope)
+    value = shown(y.value, x.value) + c * twisted + 0.5 * c * c * shown(y.curvature, x.curvature)
+    slope_x = shown(y.value, x.slope) + c * shown(y.slope, x.curvature)
+    slope_y = shown(y.slope, x.value) + c * shown(y.curvature, x.slope)
+    # Blur spreads a pattern as heat does: its derivative by a variance is half its curvature.
+    wider = of_optics[:, :1, 0] * shown(y.value, x.curvature) + of_optics[:, 1:, 1] * shown(y.curvature, x.value)
+    wider = blur[:, None] * (wider + 2.0 * of_optics[:, :1, 1] * twisted)
+    return PatternModel(value, np.stack([slope_x, slope_y]), wider)
+
+
+def _linear_terms(model: PatternModel, spread: FloatArray, grid: PatternGrid, cells: int) -> FloatArray:
+    """Linear terms (Q, L, P): the pattern, and where the contrast is graded its gradients and the surface's end."""
+    if not grid.graded:
+        return model.value[:, None]
+    # Of a blurred product with a linear function: the gradient of what is blurred moves with it.
+    displaced = (spread @ model.slopes.swapaxes(0, 1)) / cells
+    graded = model.value[:, None] * grid.middle + displaced
+    outside = np.array([-_SURFACE_ENDS, cells + _SURFACE_ENDS])
+    x, y = (_between(outside, grid.along, np.sqrt(spread[:, axis, axis])) for axis in (0, 1))
+    surface = (y[:, :, None] * x[:, None]).reshape(len(spread), 1, -1)
+    return np.concatenate([model.value[:, None], graded, surface], axis=1)
+
+
+def _between(ends: FloatArray, along: FloatArray, blur: FloatArray) -> FloatArray:
+    """Share (Q, S) of a stretch between two ``ends`` (2,) at places ``along`` (S,), for ``blur`` (Q,) [cells]."""
+    below = np.interp((ends[:, None, None] - along) / blur[:, None], _Z, _BELOW)
+    return np.asarray(below[1] - below[0])
+
+
+def _to_cells(quads: FloatArray, cells: int) -> FloatArray:
+    """Mean derivatives (Q, 2, 2) of places in markers [cells] by pixels."""
+    across = quads[:, 1] - quads[:, 0] + quads[:, 2] - quads[:, 3]
+    down = quads[:, 3] - quads[:, 0] + quads[:, 2] - quads[:, 1]
+    to_px = np.stack([across, down], axis=-1) / (2.0 * cells)
+    area = np.linalg.det(to_px)
+    collapsed = np.abs(area) < TINY
+    to_px[collapsed] = np.eye(2)
+    return np.asarray(np.linalg.inv(to_px))
+
+
+def _weights(along: FloatArray, cells: int, blur: FloatArray) -> CellWeights:
+    """Weights of cells at places ``along`` (S,) for ``blur`` (Q,) [cells]."""
+    width = blur[:, None, None]
+    z = (np.arange(cells + 1) - along[:, None]) / width
+    density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    return CellWeights(np.diff(np.interp(z, _Z, _BELOW)), -np.diff(density) / width, -np.diff(z * density) / width**2)
