@@ -36,15 +36,15 @@ class PatternGrid(NamedTuple):
     #: (4, P) of :func:`bilinear`
     weights: Float32Array
     #: (P, 3 or 6) orthonormal backgrounds
-    background: FloatArray
+    background: Float32Array
     #: (2, P) places from the middle, in sides
-    middle: FloatArray
+    middle: Float32Array
     #: samples of a cell
     density: int
     #: whether contrast is linear across the marker, else constant
     graded: bool
 
-    def without_background(self, values: FloatArray) -> FloatArray:
+    def without_background(self, values: Float32Array) -> Float32Array:
         """Values (..., P) at the samples without their background."""
         return np.asarray(values - (values @ self.background) @ self.background.T)
 
@@ -59,8 +59,8 @@ def pattern_grid(cells: int, density: int, *, bent: bool = False) -> PatternGrid
     a, b = (axis.ravel() / cells for axis in np.meshgrid(along, along))
     linear = [np.ones_like(a), a, b]
     background = np.linalg.qr(np.stack([*linear, a * a, a * b, b * b] if bent else linear, axis=1))[0]
-    weights = bilinear(a, b).astype(np.float32)
-    return PatternGrid(along, weights, background, np.stack([a, b]) - 0.5, density, graded=not bent)
+    weights, middle = bilinear(a, b).astype(np.float32), np.stack([a, b]).astype(np.float32) - np.float32(0.5)
+    return PatternGrid(along, weights, background.astype(np.float32), middle, density, graded=not bent)
 
 
 class PatternView(NamedTuple):
@@ -72,7 +72,7 @@ class PatternView(NamedTuple):
     #: (Q, 2) standard deviation of the motion blur, along the motion [px]; None: no motion
     motion: FloatArray | None = None
 
-    def gray(self, quads: FloatArray, grid: PatternGrid) -> FloatArray:
+    def gray(self, quads: FloatArray, grid: PatternGrid) -> Float32Array:
         """Values (Q, P) at the samples of markers in ``quads`` (Q, 4, 2)."""
         places = seen_between(quads, grid.weights)
         shown = self._at(places)
@@ -80,7 +80,8 @@ class PatternView(NamedTuple):
             maps = self.to_tails.transpose(1, 2, 0)[..., None].astype(np.float32)
             tails = maps[:, 0] * places[0] + maps[:, 1] * places[1] + maps[:, 2]
             shown = without_tails(shown, self._at(tails))
-        return np.asarray(shown, dtype=np.float64)
+        # Small numbers for sums in single precision.
+        return np.asarray(shown - shown[:, :1])
 
     def _at(self, places: Float32Array) -> Float32Array:
         shown = cv2.remap(self.image, places[0], places[1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
@@ -90,19 +91,19 @@ class PatternView(NamedTuple):
 class CellWeights(NamedTuple):
     """Weights (Q, S, m) of cells at samples along an axis, and their first and second derivatives by place."""
 
-    value: FloatArray
-    slope: FloatArray
-    curvature: FloatArray
+    value: Float32Array
+    slope: Float32Array
+    curvature: Float32Array
 
 
 class PatternModel(NamedTuple):
     """Blurred patterns of Q markers, (Q, P) each."""
 
-    value: FloatArray
+    value: Float32Array
     #: (2, Q, P) derivatives along columns and rows [1/cell]
-    slopes: FloatArray
+    slopes: Float32Array
     #: derivative by the blur [1/px]
-    wider: FloatArray
+    wider: Float32Array
 
 
 class PatternResiduals(NamedTuple):
@@ -117,13 +118,18 @@ class PatternResiduals(NamedTuple):
     x: CellWeights
     y: CellWeights
     #: (Q, P) gray levels, and these without the pattern; no background in either
-    seen: FloatArray
-    rest: FloatArray
+    seen: Float32Array
+    rest: Float32Array
     #: (Q,)
     contrast: FloatArray
-    #: (Q, 9 + L, P) derivatives by the corners' u and v, by blur, and by the L linear terms
-    J: FloatArray
+    #: (Q, 9 + L, P) derivatives by the corners' u and v, by blur, and by the L linear terms, with background
+    J: Float32Array
     grid: PatternGrid
+
+    def information(self) -> FloatArray:
+        """Information (Q, 9 + L, 9 + L) of samples with a variance of 1, whatever the background."""
+        hidden = self.J @ self.grid.background
+        return np.asarray(self.J @ self.J.swapaxes(1, 2) - hidden @ hidden.swapaxes(1, 2), dtype=np.float64)
 
     @property
     def pixels(self) -> FloatArray:
@@ -143,53 +149,56 @@ def linearised(
         moved = to_cells @ view.motion[..., None]
         spread = spread + moved @ moved.swapaxes(1, 2)
     x, y = (_weights(grid.along, cells, np.sqrt(spread[:, axis, axis])) for axis in (0, 1))
-    model = _model(x, y, white, spread, blur, of_optics)
+    model = _model(x, y, white, *(part.astype(np.float32) for part in (spread, blur, of_optics)))
     seen = grid.without_background(view.gray(quads, grid))
     terms = grid.without_background(_linear_terms(model, spread, grid, cells))
-    amounts = np.linalg.solve(
-        terms @ terms.swapaxes(1, 2) + TINY * np.eye(terms.shape[1]), terms @ seen[..., None]
-    )[..., 0]
-    contrast = amounts[:, :1]
+    products = np.asarray(terms @ terms.swapaxes(1, 2), dtype=np.float64) + TINY * np.eye(terms.shape[1])
+    amounts = np.linalg.solve(products, terms @ seen[..., None])
+    rest = seen - (terms.swapaxes(1, 2) @ amounts.astype(np.float32))[..., 0]
+    contrast = amounts[:, 0].astype(np.float32)
     if grid.graded:
-        contrast = contrast + amounts[:, 1:3] @ grid.middle
-    by_px = to_cells.swapaxes(1, 2) @ (model.slopes * contrast).swapaxes(0, 1)
-    J = np.empty((count, 9 + terms.shape[1], seen.shape[1]))
-    J[:, :8] = (by_px[:, :, None] * grid.weights).reshape(count, 8, -1)
+        contrast = contrast + amounts[:, 1:3, 0].astype(np.float32) @ grid.middle
+    by_px = to_cells.swapaxes(1, 2).astype(np.float32) @ (model.slopes * contrast).swapaxes(0, 1)
+    J = np.empty((count, 9 + terms.shape[1], seen.shape[1]), dtype=np.float32)
+    np.multiply(by_px[:, :, None], grid.weights, out=J[:, :8].reshape(count, 2, 4, -1))
     J[:, 8], J[:, 9:] = -contrast * model.wider, -terms
-    J[:, :9] = grid.without_background(J[:, :9])
-    rest = seen - (amounts[:, None] @ terms)[:, 0]
-    return PatternResiduals(quads, blur, to_cells, x, y, seen, rest, amounts[:, 0], J, grid)
+    return PatternResiduals(quads, blur, to_cells, x, y, seen, rest, amounts[:, 0, 0], J, grid)
 
 
 def _model(
-    x: CellWeights, y: CellWeights, white: FloatArray, spread: FloatArray, blur: FloatArray, of_optics: FloatArray
+    x: CellWeights,
+    y: CellWeights,
+    white: FloatArray,
+    spread: Float32Array,
+    blur: Float32Array,
+    of_optics: Float32Array,
 ) -> PatternModel:
     """Patterns, 0 for white and -1 for black, with a blur of covariance ``spread`` (Q, 2, 2) [cells^2].
 
     ``of_optics`` (Q, 2, 2): its derivative by the variance of the optics.
     """
-    black = white - 1.0
+    black = (white - 1.0).astype(np.float32)
 
-    def shown(down: FloatArray, across: FloatArray) -> FloatArray:
+    def shown(down: Float32Array, across: Float32Array) -> Float32Array:
         return np.asarray((down @ black @ across.swapaxes(1, 2)).reshape(len(black), -1))
 
     c = spread[:, :1, 1]
     twisted = shown(y.slope, x.slope)
-    value = shown(y.value, x.value) + c * twisted + 0.5 * c * c * shown(y.curvature, x.curvature)
+    value = shown(y.value, x.value) + c * (twisted + np.float32(0.5) * c * shown(y.curvature, x.curvature))
     slope_x = shown(y.value, x.slope) + c * shown(y.slope, x.curvature)
     slope_y = shown(y.slope, x.value) + c * shown(y.curvature, x.slope)
     # Blur spreads a pattern as heat does: its derivative by a variance is half its curvature.
     wider = of_optics[:, :1, 0] * shown(y.value, x.curvature) + of_optics[:, 1:, 1] * shown(y.curvature, x.value)
-    wider = blur[:, None] * (wider + 2.0 * of_optics[:, :1, 1] * twisted)
+    wider = blur[:, None] * (wider + np.float32(2.0) * of_optics[:, :1, 1] * twisted)
     return PatternModel(value, np.stack([slope_x, slope_y]), wider)
 
 
-def _linear_terms(model: PatternModel, spread: FloatArray, grid: PatternGrid, cells: int) -> FloatArray:
+def _linear_terms(model: PatternModel, spread: FloatArray, grid: PatternGrid, cells: int) -> Float32Array:
     """Linear terms (Q, L, P): the pattern, and where the contrast is graded its gradients and the surface's end."""
     if not grid.graded:
         return model.value[:, None]
     # Of a blurred product with a linear function: the gradient of what is blurred moves with it.
-    displaced = (spread @ model.slopes.swapaxes(0, 1)) / cells
+    displaced = (spread / cells).astype(np.float32) @ model.slopes.swapaxes(0, 1)
     graded = model.value[:, None] * grid.middle + displaced
     outside = np.array([-_SURFACE_ENDS, cells + _SURFACE_ENDS])
     x, y = (_between(outside, grid.along, np.sqrt(spread[:, axis, axis])) for axis in (0, 1))
@@ -197,10 +206,10 @@ def _linear_terms(model: PatternModel, spread: FloatArray, grid: PatternGrid, ce
     return np.concatenate([model.value[:, None], graded, surface], axis=1)
 
 
-def _between(ends: FloatArray, along: FloatArray, blur: FloatArray) -> FloatArray:
+def _between(ends: FloatArray, along: FloatArray, blur: FloatArray) -> Float32Array:
     """Share (Q, S) of a stretch between two ``ends`` (2,) at places ``along`` (S,), for ``blur`` (Q,) [cells]."""
     below = np.interp((ends[:, None, None] - along) / blur[:, None], _Z, _BELOW)
-    return np.asarray(below[1] - below[0])
+    return np.asarray(below[1] - below[0], dtype=np.float32)
 
 
 def _to_cells(quads: FloatArray, cells: int) -> FloatArray:
@@ -219,4 +228,5 @@ def _weights(along: FloatArray, cells: int, blur: FloatArray) -> CellWeights:
     width = blur[:, None, None]
     z = (np.arange(cells + 1) - along[:, None]) / width
     density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-    return CellWeights(np.diff(np.interp(z, _Z, _BELOW)), -np.diff(density) / width, -np.diff(z * density) / width**2)
+    weights = np.diff(np.interp(z, _Z, _BELOW)), -np.diff(density) / width, -np.diff(z * density) / width**2
+    return CellWeights(*(weight.astype(np.float32) for weight in weights))

@@ -32,25 +32,50 @@ _NARROW = 5.0
 _FALSE_MARKERS = 0.01
 # Largest distance of samples [px], and least number of them along a cell.
 _APART_PX, _FEWEST = 0.85, 3
-# Damping: share of the information's diagonal that is added to it. Steps of a fit, and of an alignment. Step of a corner
-# after which there is no further one [px]: a tenth of it is left.
-_DAMPING, _STEPS, _OF_ALIGNMENT, _CONVERGED_PX = 0.1, 6, 3, 0.03
+# Steps of a fit, and length of the step of a corner after which there is no further one [px].
+_STEPS, _CONVERGED_PX = 6, 0.05
+# Steps of an alignment. Damping: share of the information's diagonal that is added to it.
+_OF_ALIGNMENT, _DAMPING = 3, 0.1
 # Blur of the pattern in an alignment, so wide that it reaches an edge half a cell away [cells].
 _WIDE = 0.25
 # Smoothing of the image for it, in pixels and at most in cells; least width of cells [px].
 _SMOOTHING_PX, _SMOOTHING, _LEAST_CELL_PX = 1.0, 0.4, 0.5
 # Longest step of a corner [cells] and of the blur, and range of the blur, both in blurs of the optics.
 _LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.15, (0.5, 2.0)
-# Standard deviation of the blur, in blurs of the optics: the focus.
-_FOCUS = 0.3
+# Standard deviation of the blur, in blurs of the optics: the focus. That of the corners from where they are looked for
+# [cells].
+_FOCUS, _START = 0.3, 0.5
 # Parameters of a fit: corners, blur, contrast, background. A fit to something that is not there makes use of fewer of
 # them, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 higher below 8.
 _PARAMETERS, _OF_CHANCE = 16, 9
 # Least share of the variance that counts as left: no model is better.
 _LEAST = 1e-6
+# Share of the largest information that is added to all, for sums in single precision.
+_SINGULAR = 1e-8
 # Displacement from where a marker was decoded up to which it was decoded there [cells].
 _NEAR = 0.1
 _EYE = np.eye(2)
+
+
+class _Prior(NamedTuple):
+    """What is known of Q markers before the fit."""
+
+    #: (Q, 4, 2) [px], and standard deviation (Q,) of each coordinate
+    corners_px: FloatArray
+    corners_std: FloatArray
+    blur_px: float
+
+    def normal_equations(self, at: PatternResiduals) -> tuple[FloatArray, FloatArray]:
+        """With it, (Q, K, K), (Q, K, 1), for samples with a variance of 1."""
+        information, gradient = at.information(), _gradient(at)
+        share = _variance_of_samples(at, self.blur_px)
+        of_corner, of_blur = share / self.corners_std**2, share / (_FOCUS * self.blur_px) ** 2
+        np.einsum('qii->qi', information)[:, :8] += of_corner[:, None]
+        information[:, 8, 8] += of_blur
+        off = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
+        gradient[:, :8, 0] += of_corner[:, None] * off
+        gradient[:, 8, 0] += of_blur * (at.blur - self.blur_px)
+        return _solvable(information), gradient
 
 
 class PatternFit(NamedTuple):
@@ -111,25 +136,25 @@ def fitted_patterns(
 def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: Decoder, blur_px: float) -> PatternFit:
     """Fits of the markers ``ids`` (Q,), upright in ``quads`` (Q, 4, 2), which are accurate to half a cell."""
     white, blur = decoder.seen(ids, np.zeros_like(ids)), np.full(len(ids), blur_px)
-    cell = float(sides_px(quads).max(initial=0.0)) / decoder.cells
-    grid = pattern_grid(decoder.cells, max(_FEWEST, math.ceil(cell / _APART_PX)))
-    step = np.full(len(ids), np.inf)
+    cell = sides_px(quads) / decoder.cells
+    grid = pattern_grid(decoder.cells, max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX)))
+    prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
     for _ in range(_STEPS):
-        before = quads
-        quads, blur = _stepped(linearised(view, quads, blur, white, grid), blur_px, blur_px)
-        step = np.abs(quads - before).max(axis=(1, 2))
+        at = linearised(view, quads, blur, white, grid)
+        information, product = prior.normal_equations(at)
+        move = -np.linalg.solve(information, product)
+        quads, blur = _moved(at, move[..., 0], blur_px)
+        step = np.abs(quads - at.corners_px).max(axis=(1, 2))
         if step.max(initial=0.0) < _CONVERGED_PX:
             break
-    at = linearised(view, quads, blur, white, grid)
-    variance = _noise_variance(at, blur_px)
-    information = _information(at, variance, blur_px)
-    trace = np.trace(information, axis1=1, axis2=2)
-    information += (TINY * (1.0 + trace))[:, None, None] * np.eye(information.shape[1])
-    share = variance * at.seen.shape[1] / at.pixels
+    # The last step is so short that it changes residuals linearly.
+    hidden = grid.without_background((at.J.swapaxes(1, 2) @ move.astype(np.float32))[..., 0])
+    at = at._replace(rest=at.rest + hidden)
+    share = _variance_of_samples(at, blur_px)
     covariance = np.linalg.inv(information)[:, :8, :8] * share[:, None, None]
     # From u of all corners and v of all of them to u and v of each.
     covariance = covariance.reshape(-1, 2, 4, 2, 4).transpose(0, 2, 1, 4, 3).reshape(-1, 8, 8)
-    return PatternFit(quads, covariance, at.contrast, np.sqrt(variance), step, at)
+    return PatternFit(quads, covariance, at.contrast, np.sqrt(_noise_variance(at, blur_px)), step, at)
 
 
 def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArray, decoder: Decoder) -> FloatArray:
@@ -148,7 +173,11 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
     view = PatternView(np.asarray(cv2.GaussianBlur(image, (0, 0), smoothing), dtype=np.float32))
     blur = wide = _WIDE * cell
     for _ in range(_OF_ALIGNMENT):
-        quads, blur = _stepped(linearised(view, quads, blur, white, grid), wide)
+        at = linearised(view, quads, blur, white, grid)
+        information = at.information()
+        diagonal = np.einsum('qii->qi', information)
+        diagonal *= 1.0 + _DAMPING
+        quads, blur = _moved(at, -np.linalg.solve(_solvable(information), _gradient(at))[..., 0], wide)
     return quads
 
 
@@ -161,34 +190,30 @@ def _noise_variance(at: PatternResiduals, blur_px: float) -> FloatArray:
     return np.asarray((at.rest**2).mean(axis=1) * independent / np.maximum(independent - _PARAMETERS, 1.0))
 
 
+def _variance_of_samples(at: PatternResiduals, blur_px: float) -> FloatArray:
+    """Variance (Q,) that samples would have, were they independent and said as much as the pixels."""
+    return np.asarray(_noise_variance(at, blur_px) * at.seen.shape[1] / at.pixels)
+
+
 def _independent(at: PatternResiduals, blur_px: float) -> FloatArray:
     """Number (Q,) of independent values: pixels over what blur averages over, its noise-equivalent area."""
     return np.asarray(at.pixels / (4.0 * math.pi * np.minimum(at.blur, blur_px) ** 2))
 
 
-def _information(at: PatternResiduals, variance: FloatArray, blur_px: float) -> FloatArray:
-    """Information (Q, K, K) of samples with a variance of 1, with the prior of the blur."""
-    information = np.asarray(at.J @ at.J.swapaxes(1, 2))
-    information[:, 8, 8] += variance * at.seen.shape[1] / at.pixels / (_FOCUS * blur_px) ** 2
+def _gradient(at: PatternResiduals) -> FloatArray:
+    """Derivative (Q, K, 1) of half the sum of the squared residuals."""
+    return np.asarray(at.J @ at.rest[..., None], dtype=np.float64)
+
+
+def _solvable(information: FloatArray) -> FloatArray:
+    """Information (Q, K, K) that has an inverse where the image has no gradient in some direction."""
+    diagonal = np.einsum('qii->qi', information)
+    diagonal += _SINGULAR * (1.0 + diagonal.max(axis=1, keepdims=True))
     return information
 
 
-def _stepped(
-    at: PatternResiduals, blur_px: float | FloatArray, focus_px: float | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Corners (Q, 4, 2) and blur (Q,) after a step; ``focus_px``: expected blur, None: any."""
-    product = (at.J @ at.rest[..., None])[..., 0]
-    if focus_px is None:
-        information = at.J @ at.J.swapaxes(1, 2)
-    else:
-        variance = _noise_variance(at, focus_px)
-        information = _information(at, variance, focus_px)
-        product[:, 8] += (at.blur - focus_px) * variance * at.seen.shape[1] / at.pixels / (_FOCUS * focus_px) ** 2
-    diagonal = np.einsum('qii->qi', information)
-    diagonal *= 1.0 + _DAMPING
-    # Keeps the system solvable where the image has no gradient in some direction.
-    diagonal += TINY * (1.0 + diagonal.max(axis=1, keepdims=True))
-    step = -np.linalg.solve(information, product[..., None])[..., 0]
+def _moved(at: PatternResiduals, step: FloatArray, blur_px: float | FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners (Q, 4, 2) and blur (Q,) after a step (Q, K), which is limited."""
     longest = _LONGEST / np.sqrt(np.abs(np.linalg.det(at.to_cells)))[:, None]
     corners = at.corners_px + np.clip(step[:, :8], -longest, longest).reshape(-1, 2, 4).swapaxes(1, 2)
     wider = np.clip(step[:, 8], -_LONGEST_BLUR * blur_px, _LONGEST_BLUR * blur_px)
