@@ -71,6 +71,8 @@ class PatternView(NamedTuple):
     to_tails: FloatArray | None = None
     #: (Q, 2) standard deviation of the motion blur, along the motion [px]; None: no motion
     motion: FloatArray | None = None
+    #: whether its values are a nonlinear function of the counts
+    displayed: bool = False
 
     def gray(self, quads: FloatArray, grid: PatternGrid) -> Float32Array:
         """Values (Q, P) at the samples of markers in ``quads`` (Q, 4, 2)."""
@@ -151,13 +153,15 @@ def linearised(
     x, y = (_weights(grid.along, cells, np.sqrt(spread[:, axis, axis])) for axis in (0, 1))
     model = _model(x, y, white, *(part.astype(np.float32) for part in (spread, blur, of_optics)))
     seen = grid.without_background(view.gray(quads, grid))
-    terms = grid.without_background(_linear_terms(model, spread, grid, cells))
+    terms = grid.without_background(_linear_terms(model, spread, grid, cells, displayed=view.displayed))
     products = np.asarray(terms @ terms.swapaxes(1, 2), dtype=np.float64) + TINY * np.eye(terms.shape[1])
     amounts = np.linalg.solve(products, terms @ seen[..., None])
     rest = seen - (terms.swapaxes(1, 2) @ amounts.astype(np.float32))[..., 0]
     contrast = amounts[:, 0].astype(np.float32)
     if grid.graded:
         contrast = contrast + amounts[:, 1:3, 0].astype(np.float32) @ grid.middle
+    if view.displayed and grid.graded:
+        contrast = contrast + amounts[:, 4].astype(np.float32) * (1.0 + 2.0 * model.value)
     by_px = to_cells.swapaxes(1, 2).astype(np.float32) @ (model.slopes * contrast).swapaxes(0, 1)
     J = np.empty((count, 9 + terms.shape[1], seen.shape[1]), dtype=np.float32)
     np.multiply(by_px[:, :, None], grid.weights, out=J[:, :8].reshape(count, 2, 4, -1))
@@ -193,8 +197,13 @@ def _model(
     return PatternModel(value, np.stack([slope_x, slope_y]), wider)
 
 
-def _linear_terms(model: PatternModel, spread: FloatArray, grid: PatternGrid, cells: int) -> Float32Array:
-    """Linear terms (Q, L, P): the pattern, and where the contrast is graded its gradients and the surface's end."""
+def _linear_terms(
+    model: PatternModel, spread: FloatArray, grid: PatternGrid, cells: int, *, displayed: bool
+) -> Float32Array:
+    """Linear terms (Q, L, P): the pattern, and where the contrast is graded its gradients and the surface's end.
+
+    In a picture for a display also what a quadratic function of the counts adds between black and white.
+    """
     if not grid.graded:
         return model.value[:, None]
     # Of a blurred product with a linear function: the gradient of what is blurred moves with it.
@@ -203,7 +212,10 @@ def _linear_terms(model: PatternModel, spread: FloatArray, grid: PatternGrid, ce
     outside = np.array([-_SURFACE_ENDS, cells + _SURFACE_ENDS])
     x, y = (_between(outside, grid.along, np.sqrt(spread[:, axis, axis])) for axis in (0, 1))
     surface = (y[:, :, None] * x[:, None]).reshape(len(spread), 1, -1)
-    return np.concatenate([model.value[:, None], graded, surface], axis=1)
+    terms = [model.value[:, None], graded, surface]
+    if displayed:
+        terms.append((model.value * (1.0 + model.value))[:, None])
+    return np.concatenate(terms, axis=1)
 
 
 def _between(ends: FloatArray, along: FloatArray, blur: FloatArray) -> Float32Array:

@@ -157,7 +157,7 @@ def refine(
             )  # fmt: skip
         if len(patterns):
             moving = blur.only(patterns)
-            view = PatternView(frame.image, moving.to_tails, moving.spread)
+            view = PatternView(frame.image, moving.to_tails, moving.spread, frame.displayed)
             fitted = fitted_patterns(frame, found.only(patterns), start.only(patterns), view, decoder, config.blur_px)
             seen = seen.joined(fitted).only(np.argsort(np.concatenate([sides, patterns])))
         markers = _at_stamp(frame, found.ids, places, blur, seen, twist, track, behind.shape[2])
