@@ -155,7 +155,7 @@ def _confirmed(
     there = found.places.at.px + markers.blur.shift
     off_cells = np.abs(corners - there).max(axis=(1, 2)) * decoder.cells / se3.sides_px(there)
     keep = ((off_cells < _LITTLE) & found.certain) | markers.observed.evident
-    others = np.flatnonzero(~keep)
+    others = np.flatnonzero(~keep & ~markers.observed.refuted)
     if len(others):
         near = found.expected[others] & (off_cells[others] < _NEAR_CELLS)
         keep[others] = _readable(frame, markers.only(others), near, decoder, config)

@@ -205,7 +205,8 @@ def _corners(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> RefinedCorne
     if not deviation < _KNOWN_PX:
         return None
     contrast, noise, doubt = (np.array([value]) for value in (fit.contrast, fit.noise, 0.0))
-    return RefinedCorners(corners[None], blocks[None], contrast, noise, doubt, np.zeros(1, dtype=bool), np.zeros(1, dtype=bool))
+    no = np.zeros(1, dtype=bool)
+    return RefinedCorners(corners[None], blocks[None], contrast, noise, doubt, no, no, no)
 
 
 def _pose_covariance(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> FloatArray:

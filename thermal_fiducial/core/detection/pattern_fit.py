@@ -50,6 +50,8 @@ _FOCUS, _START = 0.3, 0.5
 _PARAMETERS, _OF_CHANCE = 16, 9
 # Least share of the variance that counts as left: no model is better.
 _LEAST = 1e-6
+# Residuals over the noise of a pixel beyond which they are more than noise.
+_MISFIT = 4.0
 # Share of the largest information that is added to all, for sums in single precision.
 _SINGULAR = 1e-8
 # Displacement from where a marker was decoded up to which it was decoded there [cells].
@@ -125,12 +127,12 @@ def fitted_patterns(
     doubt = square.doubt * squared_sides(corners).mean(axis=1)
     doubt = np.where(fit.step_px > _CONVERGED_PX, np.maximum(doubt, fit.step_px**2), doubt)
     off = np.abs(corners - start.px).max(axis=(1, 2)) * decoder.cells / sides_px(start.px)
-    shown = found.certain & (off < _NEAR)
-    others = np.flatnonzero(~shown)
-    if len(others):
-        shown[others] = _evident(fit, found.ids, found.expected, others, frame, decoder, blur_px)
     covariances, fitted = together * blocks + floor**2 * _EYE, np.ones(len(doubt), dtype=bool)
-    return RefinedCorners(corners, covariances, fit.contrast, fit.noise, doubt, fitted, shown)
+    evident, refuted = found.certain & (off < _NEAR), ~fitted
+    others = np.flatnonzero(~evident)
+    if len(others):
+        evident[others], refuted[others] = _verdicts(fit, found, others, frame, decoder, blur_px)
+    return RefinedCorners(corners, covariances, fit.contrast, fit.noise, doubt, fitted, evident, refuted)
 
 
 def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: Decoder, blur_px: float) -> PatternFit:
@@ -220,15 +222,20 @@ def _moved(at: PatternResiduals, step: FloatArray, blur_px: float | FloatArray) 
     return corners, np.clip(at.blur + wider, _BLURS[0] * blur_px, _BLURS[1] * blur_px)
 
 
-def _evident(
-    fit: PatternFit, ids: IntArray, expected: BoolArray, which: IntArray, frame: Frame, decoder: Decoder, blur_px: float
-) -> BoolArray:
-    """Which fits at places ``which`` are evidence enough, of all markers and places that might be one by chance."""
+def _verdicts(
+    fit: PatternFit, found: FoundMarkers, which: IntArray, frame: Frame, decoder: Decoder, blur_px: float
+) -> tuple[BoolArray, BoolArray]:
+    """Which fits at places ``which`` are evidence enough, of all markers and places that might be one by chance.
+
+    And which are none although the image is clear: more than noise is left, and something else may be there as well.
+    """
     height, width = frame.image.shape
-    evidence, lead = evidence_of(fit.residuals, which, ids, decoder, blur_px)
-    places = np.where(expected[which], 1.0, height * width / np.maximum(sides_px(fit.corners_px[which]) ** 2, 1.0))
-    tried = 4.0 * decoder.count * places
-    return np.asarray((evidence > np.log(tried / _FALSE_MARKERS)) & (lead > -math.log(_FALSE_MARKERS)))
+    evidence, lead = evidence_of(fit.residuals, which, found.ids, decoder, blur_px)
+    places = height * width / np.maximum(sides_px(fit.corners_px[which]) ** 2, 1.0)
+    tried = 4.0 * decoder.count * np.where(found.expected[which], 1.0, places)
+    evident = (evidence > np.log(tried / _FALSE_MARKERS)) & (lead > -math.log(_FALSE_MARKERS))
+    doubtful = np.minimum(evidence, lead) < -math.log(_FALSE_MARKERS)
+    return evident, doubtful & (fit.noise[which] > _MISFIT * frame.noise)
 
 
 def evidence_of(

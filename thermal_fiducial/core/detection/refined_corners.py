@@ -21,6 +21,7 @@ class RefinedCorners(Stacked):
         not in covariances [px^2]
     by_pattern : (N,) whether their whole pattern was fitted
     evident : (N,) whether that fit is evidence enough of the marker
+    refuted : (N,) whether the image is clear, and something else than the marker fits about as well
     """
 
     corners_px: FloatArray
@@ -30,9 +31,10 @@ class RefinedCorners(Stacked):
     doubt: FloatArray
     by_pattern: BoolArray
     evident: BoolArray
+    refuted: BoolArray
 
     @staticmethod
     def none() -> 'RefinedCorners':
         """No corners."""
         no, none = np.zeros(0), np.zeros(0, dtype=bool)
-        return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no, none, none)
+        return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no, none, none, none)

@@ -319,4 +319,4 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     uneven = OF_UNEVEN_CONTRAST_PX * segments.slope_of_contrast() / np.maximum(np.abs(contrast), TINY)
     covariances = covariances + (uneven * uneven)[:, None, None, None] * _EYE
     no = np.zeros(len(doubt), dtype=bool)
-    return RefinedCorners(corners, covariances, contrast, noise, doubt, no, no), np.flatnonzero(moving)
+    return RefinedCorners(corners, covariances, contrast, noise, doubt, no, no, no), np.flatnonzero(moving)
