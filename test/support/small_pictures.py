@@ -1,4 +1,4 @@
-"""Pictures of eight bits with small markers, and of squares and leaves that are none, drawn finely and then blurred."""
+"""Small markers in pictures and in counts, and squares and leaves that are none, drawn finely and then blurred."""
 
 import cv2
 import numpy as np
@@ -19,10 +19,15 @@ def _tilted(rng, side, tilt_deg):
     return FOCAL_PX * corners[:, :2] / (corners[:, 2:] + FOCAL_PX / side)
 
 
+def _seen(fine, blur_px):
+    """Pixels of a finely drawn scene before noise."""
+    blurred = cv2.GaussianBlur(fine, (0, 0), blur_px * _FINE)
+    return cv2.resize(blurred, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+
+
 def _developed(rng, fine, blur_px, noise, quality=None):
     """The picture of a finely drawn scene; of a JPEG where there is a quality."""
-    blurred = cv2.GaussianBlur(fine, (0, 0), blur_px * _FINE)
-    seen = cv2.resize(blurred, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    seen = _seen(fine, blur_px)
     gray = np.clip(np.rint(seen + rng.normal(0.0, noise, seen.shape)), 0, 255).astype(np.uint8)
     if quality is None:
         return gray
@@ -51,12 +56,24 @@ def _scene(rng):
 
 def with_markers(rng, bits, side, tilt_deg, *, blur_px=0.5, noise=1.5, quality=None):
     """Picture of twelve markers of a dictionary with ``bits`` (M, n, n), and ID to their corners (4, 2) [px]."""
+    fine, corners = _with_markers(rng, bits, side, tilt_deg)
+    return _developed(rng, fine, blur_px, noise, quality), corners
+
+
+def counts_with_markers(rng, bits, side, tilt_deg, *, optics_px, contrast=330.0, noise=1.5):
+    """The same in counts of 14 bits, behind optics with a blur of ``optics_px`` beside that of the pixels."""
+    fine, corners = _with_markers(rng, bits, side, tilt_deg)
+    seen = 3600.0 + contrast / (_WHITE - _BLACK) * (_seen(fine, optics_px) - _BLACK)
+    return np.rint(seen + rng.normal(0.0, noise, seen.shape)).astype(np.uint16), corners
+
+
+def _with_markers(rng, bits, side, tilt_deg):
     fine, places = _scene(rng)
     ids = rng.choice(len(bits), len(places), replace=False).tolist()
     corners = {key: _tilted(rng, side, tilt_deg) + place for key, place in zip(ids, places, strict=True)}
     for key, quad in corners.items():
         _drawn(fine, np.pad(bits[key].astype(float), 1), quad)
-    return _developed(rng, fine, blur_px, noise, quality), corners
+    return fine, corners
 
 
 def with_other_squares(rng, cells, side):

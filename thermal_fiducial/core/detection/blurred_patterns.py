@@ -15,7 +15,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.frame import without_tails, WITHOUT_TAIL
+from thermal_fiducial.core.detection.frame import without_tails
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
 from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
 
@@ -24,7 +24,8 @@ _RING = 0.5
 # Place of the end of the warm surface outside the sides [cells].
 _SURFACE_ENDS = 1.0
 # Cumulative standard normal distribution, by a table.
-_Z = np.linspace(-6.0, 6.0, 2401)
+_FARTHEST = 6.0
+_Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
 _BELOW = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z.tolist()])
 
 
@@ -238,7 +239,8 @@ def _to_cells(quads: FloatArray, cells: int) -> FloatArray:
 def _weights(along: FloatArray, cells: int, blur: FloatArray) -> CellWeights:
     """Weights of cells at places ``along`` (S,) for ``blur`` (Q,) [cells]."""
     width = blur[:, None, None]
-    z = (np.arange(cells + 1) - along[:, None]) / width
+    # So far off nothing is left, but no number in single precision is too small.
+    z = np.clip((np.arange(cells + 1) - along[:, None]) / width, -_FARTHEST, _FARTHEST)
     density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
     weights = np.diff(np.interp(z, _Z, _BELOW)), -np.diff(density) / width, -np.diff(z * density) / width**2
     return CellWeights(*(weight.astype(np.float32) for weight in weights))

@@ -1,8 +1,8 @@
 """Fit of whole patterns: corners of small markers, and alignment of inaccurate outlines.
 
-No side of a marker whose cells are hardly wider than the blur can be measured by itself: the cells behind it and the end
-of the warm surface before it reach into its pixels, the farther the more the camera is out of focus. So the blurred
-pattern is fitted to the pixels: Gauss-Newton on corners and blur, and on all that is linear.
+No side of a marker whose cells are hardly wider than the blur can be measured by itself: the cells behind it and the
+end of the warm surface before it reach into its pixels, the more the camera is out of focus. So the blurred pattern is
+fitted to the pixels: Gauss-Newton on corners and blur, and on all that is linear.
 
 The share of the variance that the pattern leaves is the evidence. A square with any other content leaves a share below
 r with a probability of the order of r^(v/2), where v is the number of independent values that the fit leaves free, at
@@ -17,6 +17,7 @@ import numpy as np
 
 from thermal_fiducial.core.detection.blurred_patterns import linearised, pattern_grid, PatternResiduals, PatternView
 from thermal_fiducial.core.detection.corner_errors import OF_DISPLAYED_PATTERN_PX, OF_PATTERN_PX
+from thermal_fiducial.core.detection.corners.sides import NARROW
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
@@ -26,8 +27,6 @@ from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.se3 import diagonals, sides_px, squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY
 
-# Width of cells, in blurs of the optics, below which whole patterns are fitted.
-_NARROW = 5.0
 # Bound on the number of false markers in a picture, were all of it squares with a black border around random bits.
 _FALSE_MARKERS = 0.01
 # Largest distance of samples [px], and least number of them along a cell.
@@ -97,7 +96,7 @@ class PatternFit(NamedTuple):
 
 def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> BoolArray:
     """Which markers (N, 4, 2) have sides that are not measured by themselves, for a blur of the optics [px]."""
-    return np.asarray(sides_px(corners_px) < _NARROW * blur_px * cells)
+    return np.asarray(sides_px(corners_px) < NARROW * blur_px * cells)
 
 
 def fitted_patterns(
@@ -144,13 +143,13 @@ def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: D
     for _ in range(_STEPS):
         at = linearised(view, quads, blur, white, grid)
         information, product = prior.normal_equations(at)
-        move = -np.linalg.solve(information, product)
-        quads, blur = _moved(at, move[..., 0], blur_px)
+        move = _step(information, product)
+        quads, blur = _moved(at, move, blur_px)
         step = np.abs(quads - at.corners_px).max(axis=(1, 2))
         if step.max(initial=0.0) < _CONVERGED_PX:
             break
     # The last step is so short that it changes residuals linearly.
-    hidden = grid.without_background((at.J.swapaxes(1, 2) @ move.astype(np.float32))[..., 0])
+    hidden = grid.without_background((at.J.swapaxes(1, 2) @ move[..., None].astype(np.float32))[..., 0])
     at = at._replace(rest=at.rest + hidden)
     share = _variance_of_samples(at, blur_px)
     covariance = np.linalg.inv(information)[:, :8, :8] * share[:, None, None]
@@ -179,7 +178,7 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
         information = at.information()
         diagonal = np.einsum('qii->qi', information)
         diagonal *= 1.0 + _DAMPING
-        quads, blur = _moved(at, -np.linalg.solve(_solvable(information), _gradient(at))[..., 0], wide)
+        quads, blur = _moved(at, _step(_solvable(information), _gradient(at)), wide)
     return quads
 
 
@@ -212,6 +211,11 @@ def _solvable(information: FloatArray) -> FloatArray:
     diagonal = np.einsum('qii->qi', information)
     diagonal += _SINGULAR * (1.0 + diagonal.max(axis=1, keepdims=True))
     return information
+
+
+def _step(information: FloatArray, gradient: FloatArray) -> FloatArray:
+    """Step (Q, K) of Gauss and Newton."""
+    return np.asarray(-np.linalg.solve(information, gradient)[..., 0], dtype=np.float64)
 
 
 def _moved(at: PatternResiduals, step: FloatArray, blur_px: float | FloatArray) -> tuple[FloatArray, FloatArray]:

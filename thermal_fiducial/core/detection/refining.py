@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.blurred_patterns import PatternView
 from thermal_fiducial.core.detection.corner_errors import (
     OF_ALL_SIDES_PX,
     of_motion_blur,
@@ -28,7 +29,7 @@ from thermal_fiducial.core.detection.corners.segments import (
     UNMEASURED,
     with_gradients,
 )
-from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, NARROW, ONE_GAUSSIAN, Sides, sides_of
+from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, ONE_GAUSSIAN, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.frame import (
     counts_of,
@@ -44,7 +45,6 @@ from thermal_fiducial.core.detection.frame import (
     WITHOUT_TAIL,
 )
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
-from thermal_fiducial.core.detection.blurred_patterns import PatternView
 from thermal_fiducial.core.detection.pattern_fit import fitted_patterns, too_small_for_sides
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refined_corners import RefinedCorners
@@ -58,9 +58,6 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 CLEAR_CNR = 20.0
 # Columns of pixels per cell for clear markers, and for faint ones.
 _OF_CLEAR, _OF_FAINT = 6, 12
-# Width of cells, in blurs, below which the model of clear markers in counts contains parallel edges. They need few
-# pixels, and none near these edges, where the model's error shows.
-_NARROW_OF_CLEAR = 4.0
 # Displacement of a corner by lag, about the blur of the optics, up to which it is modelled as symmetric blur [px].
 # Beyond it, the lag tail is removed.
 _HARDLY_PX = 0.6
@@ -142,7 +139,6 @@ def refine(
         return RefinedMarkers.none(frame)
     clear = np.abs(found.cnr).min() > CLEAR_CNR
     columns = _OF_CLEAR if clear else _OF_FAINT
-    narrow = _NARROW_OF_CLEAR if clear and not frame.displayed else NARROW
     twist, places = frame.twist, found.places
     for _ in range(_ROUNDS):
         blur = _motion_blur(frame, places, twist)
@@ -152,7 +148,7 @@ def refine(
         seen = RefinedCorners.none()
         if len(sides):
             seen = refine_corners(
-                frame.image, start.only(sides), frame.camera, behind[sides], config.blur_px, columns, narrow,
+                frame.image, start.only(sides), frame.camera, behind[sides], config.blur_px, columns,
                 blur.only(sides),
             )  # fmt: skip
         if len(patterns):
@@ -238,7 +234,6 @@ def refine_corners(
     behind: Float32Array,
     blur_px: float,
     columns: int = _OF_CLEAR,
-    narrow: float = _NARROW_OF_CLEAR,
     motion: MotionBlur | None = None,
     passes: int = _PASSES,
     uneven: BoolArray | None = None,
@@ -252,7 +247,6 @@ def refine_corners(
     behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
     blur_px : standard deviation of optics and pixel
     columns : of pixels, in a segment
-    narrow : of :func:`thermal_fiducial.core.detection.corners.sides.model`
     motion : blur by motion; none when left out
     uneven : (N,) whether a gradient of temperature displaces a side; so far of none when left out
     """
@@ -264,7 +258,7 @@ def refine_corners(
     sides = sides_of(corners.x, camera, image.shape, behind.shape[2], columns, widest)
     blur = blur_of(sides, blur_px, motion.spread, parts)
     counts = counts_of(sides.pixel, image, motion.to_tails)
-    modelled = model(sides, behind, blur, narrow)
+    modelled = model(sides, behind, blur)
     if uneven.any():
         modelled[2][:] &= _near(sides, blur, uneven)
     segments, shows = with_gradients(measure(counts, modelled, REACHED * blur.width), sides, widest)
@@ -275,7 +269,7 @@ def refine_corners(
         return refined
     start = corners.only(moving).at_pixels(refined.corners_px[moving])
     again = refine_corners(
-        image, start, camera, behind[moving], blur_px, columns, narrow, motion.only(moving), passes - 1,
+        image, start, camera, behind[moving], blur_px, columns, motion.only(moving), passes - 1,
         uneven[moving],
     )  # fmt: skip
     return refined.with_others(moving, again)
