@@ -126,7 +126,8 @@ class BadPixelFiller:
         if not len(self._target):
             return
         flat = counts.reshape(-1)
-        flat[self._target] = np.median(flat[self._around], axis=1)
+        # Half a count is rounded up.
+        flat[self._target] = np.median(flat[self._around], axis=1) + 0.5
 
 
 def _nearest_sound(bad: BoolArray, pixels: IntArray) -> IntArray:

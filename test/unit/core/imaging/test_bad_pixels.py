@@ -71,6 +71,15 @@ def test_an_edge_that_passes_a_bad_pixel_keeps_its_place():
     assert counts[8, 5] == 3000
 
 
+def test_half_a_count_is_rounded_up():
+    counts = np.full((16, 16), 1000, dtype=np.uint16)
+    counts[:, 5:] = 1001
+    # Four of its neighbours have either count.
+    counts[7, 5], counts[8, 5] = 1000, 0
+    BadPixelFiller(np.array([[5, 8]]), counts.shape).fill(counts)
+    assert counts[8, 5] == 1001
+
+
 def test_filling_leaves_all_other_pixels():
     counts = scene(3)
     before, bad = counts.copy(), np.array([[0, 0], [40, 40], [WIDTH - 1, HEIGHT - 1]])
