@@ -205,7 +205,7 @@ MECHANISMS = {
     'width of borders, slow': Mechanism('8 bits, slow', _DISPLAYED, _BORDER_WIDTH),
     'width of borders, fast': Mechanism('8 bits, fast', _DISPLAYED, _BORDER_WIDTH),
     'width of borders, carpet': Mechanism('carpet', _DISPLAYED, _BORDER_WIDTH),
-    'polarity': Mechanism('slow, 8 K, blind', ('finding:Polarity',), {}, {'polarity': 'any'}),
+    'polarity': Mechanism('slow, 8 K, blind', ('finding:FrameHistory.polarities',), {}, {'polarity': 'any'}),
     'half resolution': Mechanism('slow, 0.5 K, blind', (), {'finding:_next_scales': lambda *_, **__: _SCALES.FINE}),
     'one resolution in turn': Mechanism('slow, 8 K, blind', (), _ALL_IN_THE_SEARCH),
     'outlines pulled onto patterns': Mechanism(

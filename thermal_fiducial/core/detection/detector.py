@@ -7,13 +7,13 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.detection.confirmation import DisplayedSides, published
 from thermal_fiducial.core.detection.corners.sides import edges_behind
-from thermal_fiducial.core.detection.finding import Findings, FrameHistory, MarkerFinder
+from thermal_fiducial.core.detection.finding import FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import among, depths, ExpectedMarkers, KnownMarkers
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, Dictionary
 from thermal_fiducial.core.detection.plates import corners_of_faces
-from thermal_fiducial.core.detection.refining import refine, RefinedMarkers
+from thermal_fiducial.core.detection.refining import refine
 from thermal_fiducial.core.detection.tracking import MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -95,8 +95,7 @@ class MarkerDetector:
         expected = None
         if T_camera_map is not None and len(known.ids) and config.guided:
             expected = known.expected(T_camera_map, camera, config.min_side_px)
-        findings = self._finder.find(frame, history, known, expected, config)
-        found = findings.found
+        found, history = self._finder.find(frame, history, known, expected, config)
         refined = refine(frame, found, self._behind[found.ids], history.track, self._decoder, config)
         refined = published(frame, found, refined, self._decoder, self._displayed, config)
         ids, corners = refined.ids, refined.corners
@@ -108,7 +107,11 @@ class MarkerDetector:
         rows = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
         if T_camera_map is not None and expected is not None and among(ids, known.ids).sum() < _ENOUGH_WHOLE:
             rows = self._with_partial(rows, frame, T_camera_map, prediction.position_std_m)
-        self._history = self._after(frame, findings, refined, poses, saw_partial=len(rows) > len(ids))
+        # A twist by corners of which none was confirmed as a marker's is dropped.
+        twist = refined.twist if len(ids) else frame.twist
+        depth = depths(poses.T_camera_marker[:, 0], known.sizes[ids])
+        markers = ExpectedMarkers(ids, refined.places.at.x, depth, corners.contrast / frame.noise)
+        self._history = history.after(stamp_ns, twist, markers, saw_partial=len(rows) > len(ids))
         return rows
 
     def _poses(
@@ -131,23 +134,6 @@ class MarkerDetector:
         partial = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
         rows = np.concatenate([rows, partial])
         return np.asarray(rows[np.argsort(rows['id'], kind='stable')])
-
-    def _after(
-        self, frame: Frame, findings: Findings, refined: RefinedMarkers, poses: PlanarPoses, *, saw_partial: bool
-    ) -> FrameHistory:
-        """The history that the next frame starts from."""
-        ids, history, contrast = refined.ids, self._history, refined.corners.contrast
-        # A twist by corners of which none was confirmed as a marker's is dropped.
-        twist = refined.twist if len(ids) else frame.twist
-        depth = depths(poses.T_camera_marker[:, 0], self._known.sizes[ids])
-        markers = ExpectedMarkers(ids, refined.places.at.x, depth, contrast / frame.noise)
-        return FrameHistory(
-            history.track.after(frame.stamp_ns, twist, markers),
-            history.polarity.after(contrast),
-            saw_partial,
-            findings.since_blind,
-            findings.scales,
-        )
 
 
 def marker_rows(

@@ -4,9 +4,8 @@ A marker at its prediction is accepted if its pattern, in the predicted attitude
 better than the pattern of any other marker and than any other rotation of its own.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from thermal_fiducial.core.detection.known_markers import (
     ExpectedMarkers,
     FoundMarkers,
     KnownMarkers,
-    pairs,
 )
 from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
 from thermal_fiducial.core.detection.refining import CLEAR_CNR
@@ -42,42 +40,31 @@ _STILL_SIMILAR = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Polarity:
-    """Polarity of the latest markers: surplus of dark over bright ones, with exponential forgetting."""
-
-    balance: float = 0.0
-
-    def after(self, contrast: FloatArray) -> 'Polarity':
-        """The polarity after one more frame with markers of signed ``contrast`` (N,), white minus black."""
-        return Polarity(self.balance + float(np.sign(contrast).sum()) - self.balance / _FRAMES)
-
-    def kinds(self, rule: str) -> tuple[float, ...]:
-        """Possible polarities by the parameter ``polarity``: 1 for markers darker than their background, -1."""
-        if rule == 'any' or (rule == 'alike' and abs(self.balance) < _SURE):
-            return 1.0, -1.0
-        return (math.copysign(1.0, self.balance) if rule == 'alike' else 1.0 if rule == 'dark' else -1.0,)
-
-
-@dataclass(frozen=True, slots=True)
 class FrameHistory:
     """What a frame needs from the frames before it."""
 
     track: MotionTrack
-    polarity: Polarity = field(default_factory=Polarity)
+    #: surplus of dark over bright markers, with exponential forgetting
+    balance: float = 0.0
     #: whether the last frame showed markers that are partially visible
     saw_partial: bool = False
     #: frames since the last blind search, and the resolutions that it used
     since_blind: int = 0
     scales: SearchScales = SearchScales.ALL
 
+    def after(
+        self, stamp_ns: int, twist: Twist | None, markers: ExpectedMarkers, *, saw_partial: bool
+    ) -> 'FrameHistory':
+        """The history that the frame after one with this twist and these markers starts from."""
+        track = self.track.after(stamp_ns, twist, markers)
+        balance = self.balance + float(np.sign(markers.cnr).sum()) - self.balance / _FRAMES
+        return FrameHistory(track, balance, saw_partial, self.since_blind, self.scales)
 
-class Findings(NamedTuple):
-    """Markers found in a frame, and the state of the blind search after it."""
-
-    found: FoundMarkers
-    #: as in :class:`FrameHistory`
-    since_blind: int
-    scales: SearchScales
+    def polarities(self, rule: str) -> tuple[float, ...]:
+        """Possible ones by the parameter ``polarity``: 1 for markers darker than their background, -1."""
+        if rule == 'any' or (rule == 'alike' and abs(self.balance) < _SURE):
+            return 1.0, -1.0
+        return (math.copysign(1.0, self.balance) if rule == 'alike' else 1.0 if rule == 'dark' else -1.0,)
 
 
 class MarkerFinder:
@@ -99,8 +86,11 @@ class MarkerFinder:
         known: KnownMarkers,
         in_map: ExpectedMarkers | None,
         config: ArucoDetectorConfig,
-    ) -> Findings:
-        """Markers at the frame's stamp, accurate to a pixel or two; ``in_map``: predictions of the map's markers."""
+    ) -> tuple[FoundMarkers, FrameHistory]:
+        """Markers at the frame's stamp, accurate to a pixel or two, and the history with the blind search after it.
+
+        ``in_map``: predictions of the map's markers.
+        """
         if frame.twist is None or not config.guided:
             found, complete, holds = FoundMarkers.none(), False, False
         else:
@@ -111,10 +101,10 @@ class MarkerFinder:
         interval = config.blind_interval if holds else min(config.blind_interval, _UNSURE)
         since_blind = history.since_blind + 1
         if (complete or holds) and since_blind < interval:
-            return Findings(found, since_blind, history.scales)
+            return found, replace(history, since_blind=since_blind)
         scales = _next_scales(history, complete=complete)
         blind = self._blind(frame, history, found, scales, known, in_map, config)
-        return Findings(found.and_elsewhere(blind), 0, scales)
+        return found.and_elsewhere(blind), replace(history, since_blind=0, scales=scales)
 
     def _guided(
         self,
@@ -154,7 +144,7 @@ class MarkerFinder:
         config: ArucoDetectorConfig,
     ) -> FoundMarkers:
         """Markers by blind search, except those already ``found``."""
-        kinds, allowed = history.polarity.kinds(config.polarity), self.allowed(known, config)
+        kinds, allowed = history.polarities(config.polarity), self.allowed(known, config)
         blind = self._search.search(frame, allowed, config, found, scales, kinds)
         possible = (blind.cnr[:, None] * kinds > 0.0).any(axis=1)
         ids, corners = blind.ids[possible], blind.corners_px[possible]
@@ -164,7 +154,7 @@ class MarkerFinder:
         depth = depths(ippe_square(at.x, sizes)[:, 0], sizes)
         if in_map is not None:
             # A single marker's planar pose may be the wrong one, and with it depth and direction of the motion blur.
-            mapped, mine = pairs(in_map.ids, ids)
+            mapped, mine = np.nonzero(in_map.ids[:, None] == ids)
             depth[mine] = in_map.depth[mapped]
         places = Places.of(at, depth)
         if frame.readout > 0.0:

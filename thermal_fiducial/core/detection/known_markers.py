@@ -29,12 +29,6 @@ def among(ids: IntArray, others: IntArray) -> BoolArray:
     return np.asarray((ids[:, None] == others).any(axis=1))
 
 
-def pairs(ids: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
-    """Places, in ``ids`` (N,) and in ``others`` (M,), of the IDs that both have."""
-    first, second = np.nonzero(ids[:, None] == others)
-    return first, second
-
-
 @dataclass(frozen=True, slots=True)
 class ExpectedMarkers(Stacked):
     """Predictions of N markers.

@@ -4,19 +4,18 @@ The camera's twist is that of the odometry around the frame, else that of the la
 of the markers' corners since the last frame.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.detection.frame import LEAST_DEPTH
-from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, pairs
+from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.twist import (
-    change_since,
     corrected,
     interaction,
-    later_twist,
+    RANDOM,
     Twist,
     twist_by_odometry,
     UNKNOWN_TWIST,
@@ -51,9 +50,8 @@ class MotionTrack:
     ----------
     T_body_camera, from_body : (4, 4), (6, 6) pose of the camera on the body, map from the body's twist to the camera's
     lag : time constant of the bolometers [s]
-    stamp_ns, twist, markers : of the last frame
+    stamp_ns, twist, markers : of the last frame; the acceleration is what the last two frames show
     last_seen_ns : stamp of the last frame that showed markers
-    acceleration : (6,) that the last two frames show
     """
 
     T_body_camera: FloatArray
@@ -63,7 +61,6 @@ class MotionTrack:
     twist: Twist | None = None
     markers: ExpectedMarkers = field(default_factory=ExpectedMarkers.none)
     last_seen_ns: int | None = None
-    acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
 
     @staticmethod
     def of_rig(T_body_camera: FloatArray, lag: float = 0.0) -> 'MotionTrack':
@@ -77,7 +74,7 @@ class MotionTrack:
         saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_NS
         if self.twist is None or dt is None or not saw_lately:
             return None
-        return later_twist(self.twist, self.acceleration, dt)
+        return Twist(self.twist.ago(-dt), self.twist.covariance + dt**2 * RANDOM, self.twist.acceleration)
 
     def expected(self, stamp_ns: int, twist: Twist) -> ExpectedMarkers:
         """The last frame's markers, predicted at this frame."""
@@ -108,7 +105,7 @@ class MotionTrack:
         depth : (N, 4) [m]
         noise : (N,) standard deviation of a corner in normalised coordinates
         """
-        now, before = pairs(ids, self.markers.ids)
+        now, before = np.nonzero(ids[:, None] == self.markers.ids)
         dt = self._since(stamp_ns)
         if len(now) == 0 or dt is None:
             return predicted
@@ -140,10 +137,13 @@ class MotionTrack:
         last_seen_ns = stamp_ns if len(markers.ids) else self.last_seen_ns
         dt, acceleration = self._since(stamp_ns), np.zeros(6)
         if twist is not None and self.twist is not None and dt is not None:
-            acceleration = change_since(twist, self.twist, dt)
-        return MotionTrack(
-            self.T_body_camera, self.from_body, self.lag, stamp_ns, twist, markers, last_seen_ns, acceleration
-        )
+            # As far as it exceeds the noise of both.
+            noise = (twist.covariance.diagonal() + self.twist.covariance.diagonal()) / dt**2
+            share = RANDOM.diagonal() / (RANDOM.diagonal() + noise)
+            acceleration = share * (twist.value - self.twist.value) / dt
+        if twist is not None:
+            twist = replace(twist, acceleration=acceleration)
+        return MotionTrack(self.T_body_camera, self.from_body, self.lag, stamp_ns, twist, markers, last_seen_ns)
 
     def _since(self, stamp_ns: int) -> float | None:
         """Time since the last frame [s], negative for a late frame; None if it is too long for the motion to hold."""

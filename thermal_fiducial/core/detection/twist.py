@@ -58,18 +58,6 @@ def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
     return J
 
 
-def change_since(twist: Twist, before: Twist, seconds: float) -> FloatArray:
-    """Acceleration (6,) that a twist and the one ``seconds`` before show, as far as it exceeds their noise."""
-    noise = (twist.covariance.diagonal() + before.covariance.diagonal()) / seconds**2
-    known = RANDOM.diagonal() / (RANDOM.diagonal() + noise)
-    return np.asarray(known * (twist.value - before.value) / seconds)
-
-
-def later_twist(twist: Twist, acceleration: FloatArray, seconds: float) -> Twist:
-    """Twist ``seconds`` later, or earlier if negative."""
-    return Twist(twist.value + seconds * acceleration, twist.covariance + seconds**2 * RANDOM, acceleration)
-
-
 def twist_by_odometry(
     stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatArray, lag: float, clock_std_s: float
 ) -> Twist:
