@@ -69,6 +69,11 @@ MECHANISMS = {
         ('pose_noise:BodyPose.map_change',),
         {'pose_noise:BodyPose.map_change': lambda *_: np.zeros((6, 6))},
     ),
+    'smaller error of the map': Mechanism(
+        ('map in the making',),
+        ('pose_noise:BodyPose.map_error_left', 'update:by_map'),
+        {'pose_noise:BodyPose.map_error_left': lambda *_: np.zeros((6, 6))},
+    ),
     'size of white errors is learned': Mechanism(
         ('noise of poses', 'lasting errors'),
         off={'pose_noise:_WHITE_RANGE': (WHITE, WHITE)},

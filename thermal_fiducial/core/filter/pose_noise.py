@@ -72,9 +72,23 @@ class BodyPose:
         """
         if not self.map_covariance.any():
             return np.zeros((6, 6))
+        return (1.0 - self._same_map(last)) * self.of_map
+
+    def map_error_left(self, last: 'BodyPose') -> FloatArray:
+        """Covariance (6, 6), conventions of ``covariance``, by which the map's error of the ``last`` pose was larger.
+
+        An estimate by the last pose is off by that in the map of this one.
+        """
+        then = self._in_robot_frame(last.map_covariance)
+        to_units = np.linalg.inv(np.linalg.cholesky(self.of_map + self.shape))
+        variances, axes = np.linalg.eigh(to_units @ (then - self.of_map) @ to_units.T)
+        roots = np.linalg.solve(to_units, axes * np.sqrt(np.maximum(variances, 0.0)))
+        return np.asarray((1.0 - self._same_map(last)) * roots @ roots.T)
+
+    def _same_map(self, last: 'BodyPose') -> float:
+        """Correlation, 0 to 1, of the map's errors of this pose and of the ``last`` one."""
         then, now = self._in_robot_frame(last.map_covariance), self.of_map
-        same = math.exp(2.0 * log_overlap(then + self.shape, now + self.shape))
-        return np.asarray((1.0 - same) * now)
+        return math.exp(2.0 * log_overlap(then + self.shape, now + self.shape))
 
     @property
     def of_map(self) -> FloatArray:

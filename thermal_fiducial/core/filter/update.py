@@ -13,6 +13,7 @@ from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_t
 from thermal_fiducial.core.filter.state import (
     Estimate,
     EXTRINSICS,
+    GRAVITY,
     NavigationState,
     of_clock,
     of_core,
@@ -85,6 +86,15 @@ def by_mount(state: NavigationState) -> FloatArray:
     return np.vstack((np.eye(3), skew(state.T_body_camera[:3, 3])))
 
 
+def by_map(state: NavigationState) -> FloatArray:
+    """(48, 6) derivative of the state by a motion of the map: rotation and position in the robot frame [rad, m]."""
+    J = np.zeros((SIZE, 6))
+    J[POSE] = np.eye(6)
+    J[VELOCITY, :3] = -skew(state.velocity_body)
+    J[GRAVITY, :3] = -(skew(state.gravity) @ state.R_map_body)[:2]
+    return J
+
+
 def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, motion: MotionAtPose) -> Innovation:
     """Innovation of ``pose`` against ``estimate`` at the same instant."""
     prior = _in_view(config, estimate, pose)
@@ -144,7 +154,8 @@ def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estim
     of_view = config.systematic_pose_std**2 * pose.shape
     # Changes of the map's error are in the systematic error too.
     most = of_view + pose.of_map
-    P = estimate.covariance.copy()
+    moved = by_map(estimate.state)
+    P = estimate.covariance + moved @ pose.map_error_left(last) @ moved.T
     stays = share_that_stays(P[SYSTEMATIC, SYSTEMATIC], most)
     kept = alike * stays
     P[SYSTEMATIC] = kept @ P[SYSTEMATIC]
