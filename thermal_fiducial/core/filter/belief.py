@@ -12,7 +12,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.state import Estimate, POSITION
 from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.measurements import Condition
-from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.core.types import SECOND_NS
 
 #: Poses that the alternative must accept for each one that the estimate accepts: an estimate with a wrong clock offset
 #: still accepts some when the robot slows down.
@@ -62,10 +62,6 @@ class Hypothesis(NamedTuple):
             refused_in_row=self.refused_in_row + 1,
         )
 
-    def in_moved_map(self, T_new_old: FloatArray) -> 'Hypothesis':
-        """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-        return self._replace(estimate=self.estimate.in_moved_map(T_new_old))
-
     @property
     def in_doubt(self) -> bool:
         """Whether the latest poses were refused, ``REFUSALS_OF_DOUBT`` or more in a row."""
@@ -107,12 +103,6 @@ class Belief(NamedTuple):
     def stamp_ns(self) -> int:
         """Earliest instant of its hypotheses, older samples are not needed; without any, the stamp of the pose."""
         return min((h.estimate.stamp_ns for h in self.hypotheses), default=self.verdict.stamp_ns)
-
-    def in_moved_map(self, T_new_old: FloatArray) -> 'Belief':
-        """The belief in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-        main = self.main and self.main.in_moved_map(T_new_old)
-        alternative = self.alternative and self.alternative.in_moved_map(T_new_old)
-        return self._replace(main=main, alternative=alternative)
 
     def settled(self, config: PoseEkfConfig) -> 'Belief':
         """The belief after the alternative was compared with the estimate: dropped, promoted, or kept."""

@@ -8,7 +8,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis
 from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.measurements import Condition
-from thermal_fiducial.core.types import SECOND_NS
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Conditions that a node compares with.
 TRACKING, WAITING = Condition('tracking'), Condition('waiting for markers')
@@ -43,9 +43,12 @@ def _without_estimate(belief: Belief, config: PoseEkfConfig) -> Condition:
     return Condition('initialising', f'{begun.hits} of {config.initial_poses} poses') if begun else WAITING
 
 
-def figures_of(history: History, main: Hypothesis, gravity: float) -> dict[str, float]:
-    """Figures of the estimate ``main`` for the diagnostics (SI units); ``gravity``: its size."""
-    state, noise = main.estimate.state, main.estimate.pose_noise
+def figures_of(history: History, main: Hypothesis, T_map_first: FloatArray, gravity: float) -> dict[str, float]:
+    """Figures of the estimate ``main`` for the diagnostics (SI units).
+
+    ``T_map_first`` (4, 4): the map that it is in, in the present one; ``gravity``: its size.
+    """
+    state, noise = main.estimate.state.in_moved_map(T_map_first), main.estimate.pose_noise
     return {
         'seconds since accepted pose': coasting_seconds(history, main),
         'position std': main.estimate.position_std,

@@ -13,17 +13,19 @@ from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.hypotheses import is_of_unknown_clock, KNOWN_OFFSET_STD
 from thermal_fiducial.core.filter.imu_input import CLOCK_EVIDENCE, ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
-from thermal_fiducial.core.filter.output import odometry
+from thermal_fiducial.core.filter.output import in_corrected_map, odometry
 from thermal_fiducial.core.filter.propagation import usable_seconds
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
 from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
-from thermal_fiducial.core.measurements import CameraPose, Condition, ImuSample, Odometry
+from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.measurements import CameraPose, Condition, ImuSample, in_moved_map, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 
 #: Reason of a reset after a jump of the IMU's stamps, and of poses that wait until it is explained.
 CLOCK_JUMPED = "the IMU's clock has jumped"
+_UNMOVED = np.eye(4)
 
 
 class PoseEkf:
@@ -55,6 +57,8 @@ class PoseEkf:
         self._first_offset = camera_time_offset
         self._noise = ImuNoiseMonitor(config.imu)
         self._history = History(config, camera_time_offset)
+        #: corrections of the map since then: the filter estimates in the map as it was, and does not notice them
+        self._T_map_first = _UNMOVED
         #: on the last IMU sample
         self._verdict = Verdict.USE
 
@@ -81,7 +85,9 @@ class PoseEkf:
         history.take_in()
         if history.main is None:
             return None
-        return odometry(history.main.estimate, history.contradicting(), history.imu.last)
+        published = odometry(history.main.estimate, history.contradicting(), history.imu.last)
+        unmoved = self._T_map_first is _UNMOVED
+        return published if unmoved else in_corrected_map(published, self._T_map_first)
 
     def keep_imu(self, sample: ImuSample) -> bool:
         """Buffer an IMU sample without propagating to it: the next :meth:`add_imu` propagates over all buffered ones.
@@ -115,7 +121,7 @@ class PoseEkf:
         ``pose.stamp_ns`` is in the camera's clock; the clock offset, parameter and estimate, is added here.
         """
         off_grid_ns = self._frame_grid.off_grid(pose.stamp_ns) if self._config.estimate_time_offset else 0
-        pose = self._in_present_clock(pose)
+        pose = self._in_present_clock(in_moved_map(pose, inverse(self._T_map_first)))
         if self._history.main is None and self._camera_clock.in_question:
             return PoseUpdate(pose.stamp_ns, False, CLOCK_JUMPED, np.nan)
         if reason := self._unusable(pose):
@@ -157,8 +163,11 @@ class PoseEkf:
         return innovation is not None and is_of_unknown_clock(self._config, innovation)
 
     def move_map(self, T_new_old: FloatArray) -> None:
-        """Apply a correction of the map to estimates and buffered poses: T_new = T_new_old @ T_old."""
-        self._history.move_map(T_new_old)
+        """Follow a correction of the map: T_new = T_new_old @ T_old. Of an initialisation, poses in the old map go."""
+        if self._history.main is None:
+            self._history.forget_poses()
+            return
+        self._T_map_first = T_new_old @ self._T_map_first
 
     def _unusable(self, pose: CameraPose) -> str:
         """Why a pose cannot be used; empty if it can."""
@@ -181,11 +190,11 @@ class PoseEkf:
     def state(self) -> NavigationState | None:
         """Estimate at the newest IMU sample."""
         main = self._history.main
-        return main.estimate.state if main else None
+        return main.estimate.state.in_moved_map(self._T_map_first) if main else None
 
     @property
     def estimate(self) -> Estimate | None:
-        """State and whole covariance at the newest IMU sample."""
+        """State and whole covariance at the newest IMU sample, in the map before its corrections."""
         main = self._history.main
         return main.estimate if main else None
 
@@ -266,4 +275,4 @@ class PoseEkf:
             'time offset': self._clock_offset(main),
             'time offset std': self._time_offset_std(main),
         }
-        return numbers | of_filter | figures_of(self._history, main, self._config.gravity)
+        return numbers | of_filter | figures_of(self._history, main, self._T_map_first, self._config.gravity)

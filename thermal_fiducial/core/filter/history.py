@@ -24,8 +24,8 @@ from thermal_fiducial.core.filter.propagation import propagated, random_walks
 from thermal_fiducial.core.filter.state import Estimate
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
 from thermal_fiducial.core.filter.verdicts import PoseLog, PoseUpdate
-from thermal_fiducial.core.measurements import CameraPose, in_moved_map
-from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.types import SECOND_NS
 
 #: Without poses the propagated estimate is stored at this interval [ns], which bounds what a late pose re-propagates.
 _KEPT_EVERY_NS = 100_000_000
@@ -164,11 +164,9 @@ class History:
                 return self._innovation(belief.main, pose)
         return None
 
-    def move_map(self, T_new_old: FloatArray) -> None:
-        """Apply a correction of the map to beliefs and poses: T_new = T_new_old @ T_old."""
-        self._beliefs = [belief.in_moved_map(T_new_old) for belief in self._beliefs]
-        self._poses = [in_moved_map(pose, T_new_old) for pose in self._poses]
-        self.main = self.main and self.main.in_moved_map(T_new_old)
+    def forget_poses(self) -> None:
+        """Remove all poses and beliefs."""
+        self._poses, self._beliefs, self.main = [], [Belief()], None
 
     # --- taking in poses ------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ import numpy as np
 from thermal_fiducial.core.filter.imu_buffer import LastSample
 from thermal_fiducial.core.filter.state import CORE, Estimate, NavigationState, POSITION, PUBLISHED, ROTATION, VELOCITY
 from thermal_fiducial.core.filter.update import pose_error
-from thermal_fiducial.core.geometry.reprojection import lever_arm, twist_transfer
+from thermal_fiducial.core.geometry.reprojection import lever_arm, turned, twist_transfer
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray
@@ -60,6 +60,12 @@ def _difference(state: NavigationState, other: NavigationState) -> FloatArray:
     apart = pose_error(state, other.T_map_body)
     velocity = (other.velocity - state.velocity) @ state.R_map_body
     return np.concatenate((apart[:3], velocity, apart[3:]))
+
+
+def in_corrected_map(odometry: Odometry, T_new_old: FloatArray) -> Odometry:
+    """Odometry in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
+    covariance = turned(odometry.pose_covariance, T_new_old[:3, :3])
+    return replace(odometry, T_map_body=T_new_old @ odometry.T_map_body, pose_covariance=covariance)
 
 
 def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:

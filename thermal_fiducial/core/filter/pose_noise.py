@@ -15,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.reprojection import turned
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.types import FloatArray
 
@@ -99,14 +98,6 @@ class BodyPose:
         turn = np.zeros((6, 6))
         turn[:3, 3:] = turn[3:, :3] = self.T_map_body[:3, :3].T
         return turn @ map_covariance @ turn.T
-
-    def in_moved_map(self, T_new_old: FloatArray) -> 'BodyPose':
-        """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-        return replace(
-            self,
-            T_map_body=T_new_old @ self.T_map_body,
-            map_covariance=turned(self.map_covariance, T_new_old[:3, :3]),
-        )
 
 
 def log_overlap(A: FloatArray, B: FloatArray) -> float:
@@ -204,10 +195,6 @@ class PoseNoise:
             LearnedVariance(stamp_jitter**2, _JITTER_RANGE, _MEMORY),
             LearnedVariance(mount_vibration**2, _VIBRATION_RANGE, _MEMORY),
         )
-
-    def in_moved_map(self, T_new_old: FloatArray) -> 'PoseNoise':
-        """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-        return replace(self, last=self.last.in_moved_map(T_new_old))
 
     def covariance(self, units: WhiteUnits) -> FloatArray:
         """Covariance (6, 6) of an innovation by white errors."""

@@ -127,18 +127,6 @@ class Estimate:
     #: noise of the camera poses, as adapted to the innovations
     pose_noise: PoseNoise
 
-    def in_moved_map(self, T_new_old: FloatArray) -> 'Estimate':
-        """The estimate in a moved map: of the error coordinates only gravity's are expressed in the map, and turn."""
-        turn = np.eye(SIZE)
-        turn[GRAVITY, GRAVITY] = T_new_old[:2, :2]
-        covariance = turn @ self.covariance @ turn.T
-        return replace(
-            self,
-            state=self.state.in_moved_map(T_new_old),
-            covariance=covariance,
-            pose_noise=self.pose_noise.in_moved_map(T_new_old),
-        )
-
     def after_camera_step(self, std: float) -> 'Estimate':
         """The estimate after an unknown step of the camera's clock, of standard deviation ``std`` [s]."""
         covariance = self.covariance.copy()

@@ -10,7 +10,6 @@ from support.flights import config
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis, REFUSALS_OF_DOUBT
 from thermal_fiducial.core.filter.state import POSITION
 from thermal_fiducial.core.filter.verdicts import PoseUpdate
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import Condition
 
 CONFIG = config(initial_poses=3, reset_after=0.5, reinitialise_after=5.0, lost_position_std=1.0)
@@ -148,13 +147,3 @@ def test_samples_are_needed_from_the_earlier_hypothesis_on():
     early, late = hypothesis(), Hypothesis(known_to(0.01, FRAME_NS), 0, 0)
     assert Belief(main=late, alternative=early, verdict=verdict(2 * FRAME_NS)).stamp_ns == 0
     assert Belief(main=late, verdict=verdict(2 * FRAME_NS)).stamp_ns == FRAME_NS
-
-
-def test_a_correction_of_the_map_moves_both_hypotheses():
-    T = transform(so3_exp([0.0, 0.0, 0.4]), [1.0, -2.0, 0.5])
-    moved = BELIEF.in_moved_map(T)
-    for before, after in zip(BELIEF.hypotheses, moved.hypotheses, strict=True):
-        expected = T @ before.estimate.state.T_map_body
-        # of one product of matrices: rounding
-        np.testing.assert_allclose(after.estimate.state.T_map_body, expected, atol=1e-12)
-        assert (after.hits, after.refused_in_row) == (before.hits, before.refused_in_row)
