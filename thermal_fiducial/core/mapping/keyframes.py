@@ -26,13 +26,13 @@ _CELL_M = 0.25
 _CELL_DIRECTION = 0.25
 # Share of the budget to which the store is thinned, so that it is thinned seldom.
 _THINNED = 0.85
-# A refinement is worth its time when so many keyframes have come since the last one.
-_FEW = 15
-#: Views that a refinement in flight takes: so many of each marker, but in all neither fewer nor more than this. Over a
-#: carpet of 72 tags 3,000 views, one in four, give the map of all views; 10,000 take a second or two of a slow core.
-VIEWS_A_MARKER, FEWEST_VIEWS, MOST_VIEWS = 30, 3_000, 10_000
-# Time between two refinements for each view of the last [s]: a view takes a fifth of it on a slow core.
-_PERIOD_A_VIEW = 6e-4
+# A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
+_GROWTH, _FEW = 0.2, 15
+#: Views of markers that a refinement in flight takes: a second or two of a slow core.
+VIEWS = 10_000
+# Time between two refinements for each view of the last [s]: a view takes a third of it on a slow core. With three
+# times as much, poses from markers just placed along a chain were too vague to publish: 19 of 633 over a carpet.
+_PERIOD_A_VIEW = 3e-4
 
 
 @dataclass(frozen=True)
@@ -109,8 +109,9 @@ class Displacement:
 class LastAdjustment:
     """When an adjustment was last begun, and with what."""
 
-    #: stamp of its newest keyframe, its views and markers, and the frames that had been added until then
+    #: stamp of its newest keyframe, keyframes kept, its views and markers, and the frames added until then
     stamp_ns: int = 0
+    frames: int = 0
     views: int = 0
     markers: int = 0
     added: int = 0
@@ -188,16 +189,16 @@ class KeyframeStore:
         # A clock that was set back leaves the last one in the future.
         if 0 <= stamp_ns - last.stamp_ns < wait_ns:
             return False
-        return self._added - last.added >= _FEW or markers > last.markers
+        return self._added - last.added >= _GROWTH * last.frames + _FEW or markers > last.markers
 
-    def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int | None = None) -> Snapshot | None:
-        """Input of an adjustment, with about ``views`` views at most, by default in flight; None without keyframes."""
+    def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int) -> Snapshot | None:
+        """Input of an adjustment, with about ``views`` views of markers at most; None without keyframes."""
         if not self.frames:
             return None
         markers = len(marker_map.markers)
-        frames = self._selected(views or min(max(VIEWS_A_MARKER * markers, FEWEST_VIEWS), MOST_VIEWS))
+        frames = self._selected(views)
         number = sum(len(frame.ids) for frame in frames)
-        self._adjustment = LastAdjustment(next(reversed(self.frames)), number, markers, self._added)
+        self._adjustment = LastAdjustment(next(reversed(self.frames)), len(self.frames), number, markers, self._added)
         trusted = {key: marker for key, marker in marker_map.markers.items() if marker.trusted}
         return snapshot_of(trusted, frames, self._priors, marker_map.revision, errors)
 

@@ -22,7 +22,7 @@ from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarkers
 from thermal_fiducial.core.mapping.consistency import are_two_that_contradict, Consistency, contradicting, settled
 from thermal_fiducial.core.mapping.corner_bias import CornerBias
-from thermal_fiducial.core.mapping.keyframes import KeyframeStore
+from thermal_fiducial.core.mapping.keyframes import KeyframeStore, VIEWS
 from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import jump, MapperResult, MarkerMap
@@ -199,14 +199,14 @@ class MarkerMapper:
             return False
         return self._keyframes.refinement_due(stamp_ns, self.config.refinement_period, len(self.map.markers))
 
-    def snapshot(self, views: int | None = None) -> Snapshot | None:
+    def snapshot(self, views: int = VIEWS) -> Snapshot | None:
         """Input of ``bundle_adjustment.refine``; None without keyframes.
 
         The snapshot is immutable: the refinement may run elsewhere while frames are processed.
 
         Parameters
         ----------
-        views : approximate largest number of views of markers, which bounds the time; None: as in flight
+        views : approximate largest number of views of markers, which bounds the time
         """
         return self._keyframes.snapshot(self.map, self._errors, views)
 

@@ -3,15 +3,11 @@
 import time
 
 import numpy as np
-import pytest
 from support.walls import CAMERA, flight
 
-from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore
-from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-
-TENTH_NS = 100_000_000
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 
 
 def frame(stamp, T):
@@ -86,34 +82,3 @@ def test_rotations_stay_rotations_however_often_the_map_moves():
         moved = store.move({k: step @ store.frames[k].T_map_camera for k, step in steps.items()})
         R = np.stack([f.T_map_camera[:3, :3] for f in store.frames.values()] + [moved.at(3)[:3, :3]])
         np.testing.assert_allclose(np.swapaxes(R, -1, -2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
-
-
-def filled(frames, markers):
-    """A store with so many frames of so many markers, 10 a second."""
-    store = KeyframeStore(2000, MarkerMap())
-    for k in range(frames):
-        shown = np.arange(markers), np.zeros((markers, 4, 2)), np.broadcast_to(np.eye(2), (markers, 4, 2, 2))
-        store.add(Keyframe(k * TENTH_NS, flight(k / 30), CAMERA, *shown))
-    return store, MarkerMap({key: MapMarker(key, 0.3, key == 0, np.eye(4)) for key in range(markers)})
-
-
-@pytest.mark.parametrize('before', [20, 400])
-def test_an_adjustment_is_due_as_soon_late_in_a_flight_as_early(before):
-    """What the last seconds add does not become less by what was there before: a loop may have closed."""
-    store, marker_map = filled(before, 2)
-    store.snapshot(marker_map, SystematicErrors())
-    due = []
-    for k in range(before, before + 40):
-        store.add(frame(k * TENTH_NS, flight(k / 30)))
-        due.append(store.refinement_due(k * TENTH_NS, 1.0, 2))
-    # Fifteen frames; more than the second that is asked for.
-    assert due.index(True) == 14
-
-
-@pytest.mark.parametrize(('markers', 'views'), [(20, 3000), (150, 4500)])
-def test_a_refinement_in_flight_takes_a_part_of_the_views(markers, views):
-    store, marker_map = filled(400, markers)
-    taken = len(store.snapshot(marker_map, SystematicErrors()).ids)
-    # Each of the cells has the same number of frames or all that it has.
-    assert 0.7 * views < taken < 1.2 * views
-    assert len(store.snapshot(marker_map, SystematicErrors(), views=10**6).ids) == 400 * markers
