@@ -147,6 +147,9 @@ def linearised(
     count, cells = white.shape[:2]
     to_cells = _to_cells(quads, cells)
     of_optics = to_cells @ to_cells.swapaxes(1, 2)
+    if not grid.graded:
+        # Outlines that are aligned are as oblique as they are inaccurate, and their blur is none of the optics.
+        of_optics = of_optics * np.eye(2)
     spread = (blur * blur)[:, None, None] * of_optics
     if view.motion is not None:
         moved = to_cells @ view.motion[..., None]
@@ -163,7 +166,9 @@ def linearised(
         contrast = contrast + amounts[:, 1:3, 0].astype(np.float32) @ grid.middle
     if view.displayed and grid.graded:
         contrast = contrast + amounts[:, 4].astype(np.float32) * (1.0 + 2.0 * model.value)
-    by_px = to_cells.swapaxes(1, 2).astype(np.float32) @ (model.slopes * contrast).swapaxes(0, 1)
+    # Steps of an alignment are long: what of the slopes looks like background is not trusted.
+    slopes = model.slopes if grid.graded else grid.without_background(model.slopes)
+    by_px = to_cells.swapaxes(1, 2).astype(np.float32) @ (slopes * contrast).swapaxes(0, 1)
     J = np.empty((count, 9 + terms.shape[1], seen.shape[1]), dtype=np.float32)
     np.multiply(by_px[:, :, None], grid.weights, out=J[:, :8].reshape(count, 2, 4, -1))
     J[:, 8], J[:, 9:] = -contrast * model.wider, -terms

@@ -52,7 +52,7 @@ _LEAST = 1e-6
 # Residuals over the noise of a pixel beyond which they are more than noise.
 _MISFIT = 4.0
 # Share of the largest information that is added to all, for sums in single precision.
-_SINGULAR = 1e-8
+_SINGULAR = 1e-9
 # Displacement from where a marker was decoded up to which it was decoded there [cells].
 _NEAR = 0.1
 _EYE = np.eye(2)
