@@ -178,9 +178,11 @@ _DISPLAYED = 'confirmation:DisplayedSides', 'confirmation:_outward'
 _BORDER_WIDTH = {'confirmation:DisplayedSides.corrected': lambda _, __, refined, ___: refined.corners}
 
 MECHANISMS = {
-    'corners of squares': Mechanism('slow, 0.5 K, blind', ('corners.squares',), {'refining:as_squares': _as_seen}),
+    'corners of squares': Mechanism(
+        'slow, 0.5 K, blind', ('corners.squares',), {'corners.side_fit:as_squares': _as_seen}
+    ),
     'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_INCONSISTENT': np.inf}),
-    'passes until settled': Mechanism('fast, 8 K, blind', (), {'refining:_PASSES': 1}),
+    'passes until settled': Mechanism('fast, 8 K, blind', (), {'corners.side_fit:_PASSES': 1}),
     'second round': Mechanism('fast, 8 K, blind', (), {'refining:_ROUNDS': 1}),
     'edges behind the sides': Mechanism(
         'fast, 8 K, blind',
@@ -189,11 +191,11 @@ MECHANISMS = {
     ),
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
-    'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'refining:_HARDLY_PX': np.inf}),
+    'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'frame:_HARDLY_PX': np.inf}),
     'ends of motion blur': Mechanism(
         'fast, 8 K, guided',
         ('frame:_moments', 'frame:_halves'),
-        {'refining:WITHOUT_TAIL': _place('corners.sides:ONE_GAUSSIAN')},
+        {'corners.side_fit:WITHOUT_TAIL': _place('corners.sides:ONE_GAUSSIAN')},
     ),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(

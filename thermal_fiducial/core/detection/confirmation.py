@@ -48,8 +48,8 @@ _WHITE = (0.4, 1.75)
 _NEAR_CELLS = 0.7
 # Distance from the image's border below which a marker, by its refined corners, counts as possibly cut off [px].
 _BORDER_PX = 1.0
-# Doubt of the corners beyond which an outline is no marker's [cells]: by so much its sides form no square in space, or are
-# still moved by the fit.
+# Doubt of the corners beyond which an outline is no marker's [cells]: by so much its sides form no square in space, or
+# are still moved by the fit.
 _DOUBTFUL_CELLS = 0.5
 # Displacement or standard deviation of blur that cells are read in spite of [cells].
 _LITTLE = 0.1

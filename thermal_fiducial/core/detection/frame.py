@@ -39,6 +39,9 @@ _EXACT = cv2.INTER_LANCZOS4
 # Age m from which on the response counts as lag tail, in time constants, and the weight b of the tail.
 _TAIL = 0.75
 _FORGOTTEN = math.exp(-_TAIL)
+# Displacement of a corner by lag, about the blur of the optics, up to which it is modelled as symmetric blur [px].
+# Beyond it, the lag tail is removed.
+_HARDLY_PX = 0.6
 # Weight of the present image when the lag tail is removed.
 _GAIN = 1.0 / (1.0 - _FORGOTTEN)
 
@@ -201,3 +204,38 @@ def lag_tail_maps(corners_px: FloatArray, lag_blur_px: FloatArray) -> FloatArray
     A_T = A.swapaxes(1, 2)
     blur = np.linalg.solve(A_T @ A, A_T @ lag_blur_px).swapaxes(1, 2)
     return np.asarray(np.eye(2, 3) - _TAIL * blur)
+
+
+@dataclass(frozen=True, slots=True)
+class MotionBlur(Stacked):
+    """Displacement and blur of N markers by motion, after the lag tail is removed where it is large."""
+
+    #: (N, 2, 3) affine maps from pixels to their lag tails, which are removed; None: the blur is too small for that
+    to_tails: FloatArray | None
+    #: (N, 4, 2) displacement of the corners in the image from their places at the stamp [px]
+    shift: FloatArray
+    #: (N, 4, 2) part of the displacement that vanishes with the lag tail [px]
+    removed: FloatArray
+    #: (N, 2) standard deviation of the remaining motion blur, along the motion [px]
+    spread: FloatArray
+
+    @staticmethod
+    def none(count: int) -> 'MotionBlur':
+        """Of ``count`` markers at rest."""
+        still = np.zeros((count, 4, 2))
+        return MotionBlur(None, still, still, still[:, 0])
+
+
+def motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlur:
+    """Motion blur of all markers; lag tails are removed if the largest displacement by lag is not small."""
+    lag_blur = np.zeros_like(places.at.px) if twist is None else places.lag_blur(twist, frame.lag)
+    mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
+    if twist is None or (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
+        return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
+    # So far the velocity has carried the image since its lag tail was seen, as the read-out shows it.
+    tail = places.lag_blur(twist, frame.lag, LAG_TAIL_AGE)
+    if frame.readout > 0.0:
+        tail = tail * stretch(places, twist, frame)[..., None]
+    removed = (1.0 - REMAINING) * tail
+    shift = lag_blur - removed + rolling
+    return MotionBlur(lag_tail_maps(places.at.px + shift, tail), shift, removed, SPREAD * mean)

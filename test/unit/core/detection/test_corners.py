@@ -6,8 +6,8 @@ import pytest
 from support.lens_planes import plane_points
 
 from thermal_fiducial.core.detection.corner_errors import OF_SIDES_PX
+from thermal_fiducial.core.detection.corners.side_fit import refine_corners
 from thermal_fiducial.core.detection.corners.sides import edges_behind
-from thermal_fiducial.core.detection.refining import refine_corners
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
