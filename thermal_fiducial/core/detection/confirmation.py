@@ -48,9 +48,6 @@ _WHITE = (0.4, 1.75)
 _NEAR_CELLS = 0.7
 # Distance from the image's border below which a marker, by its refined corners, counts as possibly cut off [px].
 _BORDER_PX = 1.0
-# Doubt of the corners beyond which an outline is no marker's [cells]: by so much its sides form no square in space, or
-# are still moved by the fit.
-_DOUBTFUL_CELLS = 0.5
 # Displacement or standard deviation of blur that cells are read in spite of [cells].
 _LITTLE = 0.1
 # Half the window of ``cornerSubPix``: in cells, and at most in pixels.
@@ -153,7 +150,7 @@ def published(
 def _confirmed(
     frame: Frame, found: FoundMarkers, markers: RefinedMarkers, decoder: Decoder, config: ArucoDetectorConfig
 ) -> BoolArray:
-    """Which markers show their pattern at the refined corners, and are squares."""
+    """Which markers show their pattern at the refined corners."""
     corners = markers.observed.corners_px
     there = found.places.at.px + markers.blur.shift
     off_cells = np.abs(corners - there).max(axis=(1, 2)) * decoder.cells / se3.sides_px(there)
@@ -162,9 +159,7 @@ def _confirmed(
     if len(others):
         near = found.expected[others] & (off_cells[others] < _NEAR_CELLS)
         keep[others] = _readable(frame, markers.only(others), near, decoder, config)
-    keep &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
-    cell_px = se3.sides_px(corners) / decoder.cells
-    return np.asarray(keep & (markers.observed.doubt <= (_DOUBTFUL_CELLS * cell_px) ** 2))
+    return np.asarray(keep & frame.camera.contains(corners, _BORDER_PX).all(axis=1))
 
 
 def _readable(

@@ -2,7 +2,6 @@
 
 from types import SimpleNamespace
 
-import cv2
 import numpy as np
 import pytest
 from support.scenes import camera_of
@@ -93,17 +92,3 @@ def test_raw_counts_are_claimed_better_than_a_display(frames):
     bent = last_rows(frames, lambda counts: displayed(counts, 2.0))
     # Measured: 0.016 and 0.13 px.
     assert np.median(raw['sigma_px']) < 0.05 < 0.1 < np.median(bent['sigma_px'])
-
-
-@pytest.mark.parametrize(('height', 'found'), [(120, [3]), (90, []), (60, [])])
-def test_a_pattern_that_is_no_square_in_space_is_no_marker(detector, height, found):
-    # Held obliquely, a square of 120 px in the image would be narrower on its far side.
-    camera = camera_of(named('wall'))
-    cells = np.pad(load_dictionary('DICT_4X4_50').bits[3], 2)
-    cells[:1] = cells[-1:] = cells[:, :1] = cells[:, -1:] = 1
-    drawn = cv2.resize(cells.astype(np.float32), (160, height * 4 // 3), interpolation=cv2.INTER_NEAREST)
-    image = np.zeros((camera.height, camera.width), np.float32)
-    image[40 : 40 + drawn.shape[0], 60 : 60 + drawn.shape[1]] = drawn
-    noise = np.random.default_rng(0).normal(0.0, 1.5, image.shape)
-    counts = np.rint(7000.0 + 200.0 * cv2.GaussianBlur(image, (0, 0), 0.66) + noise).astype(np.uint16)
-    assert detector.detect(0, counts, camera)['id'].tolist() == found
