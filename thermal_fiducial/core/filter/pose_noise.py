@@ -78,6 +78,8 @@ class BodyPose:
 
         An estimate by the last pose is off by that in the map of this one.
         """
+        if not last.map_covariance.any():
+            return np.zeros((6, 6))
         then = self._in_robot_frame(last.map_covariance)
         to_units = np.linalg.inv(np.linalg.cholesky(self.of_map + self.shape))
         variances, axes = np.linalg.eigh(to_units @ (then - self.of_map) @ to_units.T)
