@@ -208,6 +208,7 @@ def test_lockstep_equals_the_pipeline(run, folder):
     assert [_line(*pose) for pose in fused] == (run / 'fused.tum').read_text().splitlines()
     rows = [line.split(',')[:10] for line in (run / 'detections.csv').read_text().splitlines()[1:]]
     assert corners == rows
+    pipeline.finish()
     save_map(folder / 'pipeline.yaml', pipeline.mapper.map)
     assert (folder / 'pipeline.yaml').read_bytes() == (run / 'marker_map.yaml').read_bytes()
 

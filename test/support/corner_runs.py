@@ -201,11 +201,20 @@ class _Chain:
             self.filter.add_pose(pose)
         if (offset := self.filter.camera_time_offset) is not None:
             self._prior.set_clock_offset(offset)
-        snapshot = self.mapper.snapshot() if self.mapper.refinement_due(stamp_ns) else None
+        if self.mapper.refinement_due(stamp_ns):
+            self._refine()
+        return pose
+
+    def finish(self) -> None:
+        """Refine the map with the last keyframes, as the node does before it saves."""
+        if self.mapper.has_unrefined:
+            self._refine()
+
+    def _refine(self):
+        snapshot = self.mapper.snapshot()
         refinement = None if snapshot is None else refine(snapshot)
         if refinement is not None:
             self.mapper.apply(refinement)
-        return pose
 
 
 def fly(flight, marker_map=None, *, mode='localization', late=0.03, left_out=(), second=None, **config) -> Run:
@@ -241,6 +250,7 @@ def fly(flight, marker_map=None, *, mode='localization', late=0.03, left_out=(),
         else:
             poses.append(chain.add_frame(item))
     poses = [pose for pose in poses if pose is not None]
+    chain.finish()
     return Run(
         flight,
         published(flight, [state for state in states if state]),

@@ -146,6 +146,11 @@ class Pipeline:
             self._share_map()
         return FrameResult(stamp_ns, markers=markers, mapping=mapping, update=update)
 
+    def finish(self) -> None:
+        """Refine the map with the last keyframes, as the mapper does before it saves at the end."""
+        if self.mapper.has_unrefined and self._refine():
+            self._share_map()
+
     def _refine(self) -> bool:
         snapshot = self.mapper.snapshot()
         refinement = None if snapshot is None else refine(snapshot)

@@ -26,6 +26,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('marker_mapper', MarkerMapperConfig, **kwargs)
         self._map = MapServices(self, self._publish_jump)
+        self.endings.append(self._map.close)
         self.mapper = self._map.mapper
         self._result = MapperResult(0, None, 'no markers yet')
         self._topics = MapTopics(self)
@@ -69,9 +70,9 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         super().diagnose(stamp_ns)
         self._topics.draw_for_listeners(self.mapper.map, self._result.in_view, self._result.stamp_ns)
 
-    def close(self) -> None:
-        """Terminate a running refinement; save the map if it has changed."""
-        self._map.close()
+    def finish(self) -> None:
+        """Refine the map once more at the end of a flight."""
+        self._map.finish()
 
     def state(self) -> tuple[bytes, str]:
         """Why the last frame gave no pose, doubts about map and file, quarantined markers, skipped frames."""

@@ -111,6 +111,8 @@ class _Graph:
             last_ns = message.stamp_ns
         # At the last message, not a full second later: rates would include the time after the end.
         self._diagnose(max(last_ns, next_diagnosis - SECOND_NS + 1))
+        for stage in self._stages:
+            stage.finish()
 
     def _diagnose(self, time_ns: int) -> None:
         for stage in self._stages:

@@ -191,6 +191,11 @@ class KeyframeStore:
             return False
         return self._added - last.added >= _GROWTH * last.frames + _FEW or markers > last.markers
 
+    @property
+    def grown(self) -> bool:
+        """Whether keyframes have come since the last adjustment was begun."""
+        return self._added > self._adjustment.added
+
     def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int) -> Snapshot | None:
         """Input of an adjustment, with about ``views`` views of markers at most; None without keyframes."""
         if not self.frames:

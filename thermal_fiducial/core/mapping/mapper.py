@@ -199,6 +199,11 @@ class MarkerMapper:
             return False
         return self._keyframes.refinement_due(stamp_ns, self.config.refinement_period, len(self.map.markers))
 
+    @property
+    def has_unrefined(self) -> bool:
+        """Whether the map may be refined with keyframes that no bundle adjustment has had."""
+        return not self.frozen and self.config.refinement_period > 0.0 and self._keyframes.grown
+
     def snapshot(self, views: int = VIEWS) -> Snapshot | None:
         """Input of ``bundle_adjustment.refine``; None without keyframes.
 

@@ -187,6 +187,9 @@ class StageNode(CountingNode, Generic[Config]):
         """Key-value pairs of the stage for the diagnostics."""
         return {}
 
+    def finish(self) -> None:
+        """Complete what a flight that ends leaves to do; not called by a node that is to start again, or crashed."""
+
     def close(self) -> None:
         """Run the ``endings`` before the node is destroyed, for example to save files."""
         for end in self.endings:

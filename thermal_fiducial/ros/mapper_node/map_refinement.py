@@ -1,5 +1,7 @@
 """Bundle adjustment of the map in the background: in a separate process while the map may change."""
 
+import time
+
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
@@ -40,8 +42,7 @@ class MapRefinement:
             return False
         if not self._worker.busy and self._mapper.refinement_due(stamp_ns):
             self._begin(self._worker)
-        refinement = self._worker.take()
-        return refinement is not None and self._mapper.apply(refinement)
+        return self._apply(self._worker.take())
 
     def start(self) -> None:
         """Start a refinement now.
@@ -58,11 +59,35 @@ class MapRefinement:
         if not self._begin(self._worker):
             raise InputError('nothing to refine yet')
 
+    def finish(self, seconds: float) -> bool:
+        """Refine the map of a flight that has ended, with its last keyframes, if ``seconds`` are enough.
+
+        Returns
+        -------
+        Whether a refinement was applied.
+
+        Raises
+        ------
+        InputError
+            A refinement failed.
+        """
+        if self._worker is None:
+            return False
+        until = time.monotonic() + seconds
+        # First one that is under way, or the start of its process.
+        changed = self._apply(self._worker.wait(seconds))
+        if not self._worker.busy and self._mapper.has_unrefined and self._begin(self._worker):
+            changed |= self._apply(self._worker.wait(until - time.monotonic()))
+        return changed
+
     def _begin(self, worker: Worker) -> bool:
         snapshot = self._mapper.snapshot()
         if snapshot is not None:
             worker.start(snapshot)
         return snapshot is not None
+
+    def _apply(self, refinement: AdjustedMap | None) -> bool:
+        return refinement is not None and self._mapper.apply(refinement)
 
     def close(self) -> None:
         """Terminate the process, even during a refinement."""

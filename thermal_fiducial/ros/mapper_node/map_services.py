@@ -26,6 +26,8 @@ Made = TypeVar('Made')
 
 #: Time for which a service waits for a disk [s]; no frame is processed meanwhile.
 _PATIENCE_S = 1.0
+#: Time for the last refinement [s]: one takes a second or two, and ros2 launch grows impatient after five.
+_LAST_REFINEMENT_S = 3.0
 
 
 class MapServices:
@@ -147,6 +149,19 @@ class MapServices:
         self.refinement.prepare()
         response.success, response.message = True, 'map frozen' if request.data else 'map free'
         return response
+
+    def finish(self) -> None:
+        """Refine the map with the last keyframes of the flight, before it is saved at the end.
+
+        A copy is saved first: whoever starts the node may kill it for taking its time.
+        """
+        if not (self._node.config.map_file and self._keeper.unsaved):
+            return
+        self._keeper.autosave(self.mapper.map)
+        try:
+            self.refinement.finish(_LAST_REFINEMENT_S)
+        except InputError as error:
+            self._node.get_logger().warning(f'the map is saved as it was in flight: {error}')
 
     def close(self) -> None:
         """Terminate a running refinement; save the map if it has changed.

@@ -127,7 +127,9 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             ending.callback(node.close)
             executor.add_node(node)
             _spin(node, executor, stop)
-            return bool(node.deaf) and not stop.asked
+            if node.deaf and not stop.asked:
+                return True
+            node.finish()
         except InputError:
             raise
         except ExternalShutdownException:

@@ -36,6 +36,10 @@ class Foreground(Generic[Task, Result]):
         result, self._result = self._result, None
         return result
 
+    def wait(self, seconds: float) -> Result | None:
+        """The result, as :meth:`take`: it is there at once."""
+        return self.take()
+
     def close(self) -> None:
         """Nothing to stop."""
 
@@ -127,6 +131,12 @@ class Background(Generic[Task, Result]):
         if isinstance(outcome, Exception):
             raise InputError(f'{self._function.__name__} failed: {outcome}')
         return outcome
+
+    def wait(self, seconds: float) -> Result | None:
+        """The result, as :meth:`take`, but wait up to ``seconds`` for it."""
+        if self._thread is not None:
+            self._thread.join(seconds)
+        return self.take()
 
     def close(self) -> None:
         """Terminate the process, even during a task."""
