@@ -68,8 +68,17 @@ def stuck_socket():
     return ours.detach(), other.detach()
 
 
-@pytest.mark.parametrize('make', [full_pipe, stopped_terminal, stuck_socket])
-@pytest.mark.parametrize(('way', 'status'), [('talks', 0), ('refused', 2)])
+@pytest.mark.parametrize(
+    ('make', 'way', 'status'),
+    [
+        (full_pipe, 'talks', 0),
+        (stopped_terminal, 'talks', 0),
+        (stuck_socket, 'refused', 2),
+        pytest.param(full_pipe, 'refused', 2, marks=pytest.mark.nightly),
+        pytest.param(stopped_terminal, 'refused', 2, marks=pytest.mark.nightly),
+        pytest.param(stuck_socket, 'talks', 0, marks=pytest.mark.nightly),
+    ],
+)
 def test_a_node_whose_output_nobody_reads_works_on_and_ends_as_it_should(make, way, status):
     writing, reading = make()
     try:
@@ -90,7 +99,9 @@ def test_other_programs_at_the_same_pipe_still_wait_for_their_reader():
         os.close(writing)
 
 
-@pytest.mark.parametrize('closing', ['2>&-', '>&- 2>&-', '2>/dev/null'])
+@pytest.mark.parametrize(
+    'closing', ['>&- 2>&-', *(pytest.param(closing, marks=pytest.mark.nightly) for closing in ('2>&-', '2>/dev/null'))]
+)
 def test_a_node_without_a_console_runs(closing):
     line = f'exec "$0" -c "$1" talks {closing}'
     done = subprocess.run(['sh', '-c', line, sys.executable, PROGRAM], timeout=60, check=False, env=environment())
