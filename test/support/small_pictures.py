@@ -35,9 +35,15 @@ def _developed(rng, fine, blur_px, noise, quality=None):
     return cv2.imdecode(file, cv2.IMREAD_GRAYSCALE)
 
 
-def _drawn(fine, cells, corners):
-    """Draw ``cells`` (m, m), 1 for white, with a white margin of one, to ``corners`` (4, 2) [px]."""
-    texture = _BLACK + (_WHITE - _BLACK) * np.kron(np.pad(cells, 1, constant_values=1.0), np.ones((_CELL, _CELL)))
+def _drawn(fine, cells, corners, fall=0.0):
+    """Draw ``cells`` (m, m), 1 for white, with a white margin of one, to ``corners`` (4, 2) [px].
+
+    White falls to black by the share ``fall`` from the middle to the corners, with the squared distance.
+    """
+    white = np.kron(np.pad(cells, 1, constant_values=1.0), np.ones((_CELL, _CELL)))
+    along = (np.arange(len(white)) + 0.5 - 0.5 * len(white)) / (len(cells) * _CELL)
+    white *= 1.0 - 2.0 * fall * (along[:, None] ** 2 + along**2)
+    texture = _BLACK + (_WHITE - _BLACK) * white
     low, high = _CELL - 0.5, texture.shape[0] - _CELL - 0.5
     source = np.float32([[low, low], [high, low], [high, high], [low, high]])
     place = np.float32((corners + 0.5) * _FINE - 0.5)
@@ -60,19 +66,22 @@ def with_markers(rng, bits, side, tilt_deg, *, blur_px=0.5, noise=1.5, quality=N
     return _developed(rng, fine, blur_px, noise, quality), corners
 
 
-def counts_with_markers(rng, bits, side, tilt_deg, *, optics_px, contrast=330.0, noise=1.5):
-    """The same in counts of 14 bits, behind optics with a blur of ``optics_px`` beside that of the pixels."""
-    fine, corners = _with_markers(rng, bits, side, tilt_deg)
+def counts_with_markers(rng, bits, side, tilt_deg, *, optics_px, contrast=330.0, noise=1.5, fall=0.0):
+    """The same in counts of 14 bits, behind optics with a blur of ``optics_px`` beside that of the pixels.
+
+    ``fall``: share by which the warm surface behind each marker falls from its middle to its corners.
+    """
+    fine, corners = _with_markers(rng, bits, side, tilt_deg, fall)
     seen = 3600.0 + contrast / (_WHITE - _BLACK) * (_seen(fine, optics_px) - _BLACK)
     return np.rint(seen + rng.normal(0.0, noise, seen.shape)).astype(np.uint16), corners
 
 
-def _with_markers(rng, bits, side, tilt_deg):
+def _with_markers(rng, bits, side, tilt_deg, fall=0.0):
     fine, places = _scene(rng)
     ids = rng.choice(len(bits), len(places), replace=False).tolist()
     corners = {key: _tilted(rng, side, tilt_deg) + place for key, place in zip(ids, places, strict=True)}
     for key, quad in corners.items():
-        _drawn(fine, np.pad(bits[key].astype(float), 1), quad)
+        _drawn(fine, np.pad(bits[key].astype(float), 1), quad, fall)
     return fine, corners
 
 

@@ -5,7 +5,8 @@ columns and that of its rows are products. A blur that is oblique there, as that
 correlation c besides, and a Gaussian with it is exp(c d2/dxdy) of one without.
 
 All that is linear is part of the model. The warm surface and the sheet before it each have a temperature that is linear
-across the marker, so level and contrast are. The surface may end one cell outside the marker.
+across the marker, so level and contrast are. The surface may be warmest in its middle, and may end one cell outside the
+marker.
 """
 
 from functools import cache
@@ -38,8 +39,9 @@ class PatternGrid(NamedTuple):
     weights: Float32Array
     #: (P, 3 or 6) orthonormal backgrounds
     background: Float32Array
-    #: (2, P) places from the middle, in sides
+    #: (2, P) places from the middle, in sides, and their squared distances (P,) from there
     middle: Float32Array
+    bowl: Float32Array
     #: samples of a cell
     density: int
     #: whether contrast is linear across the marker, else constant
@@ -61,7 +63,8 @@ def pattern_grid(cells: int, density: int, *, bent: bool = False) -> PatternGrid
     linear = [np.ones_like(a), a, b]
     background = np.linalg.qr(np.stack([*linear, a * a, a * b, b * b] if bent else linear, axis=1))[0]
     weights, middle = bilinear(a, b).astype(np.float32), np.stack([a, b]).astype(np.float32) - np.float32(0.5)
-    return PatternGrid(along, weights, background.astype(np.float32), middle, density, graded=not bent)
+    bowl = (middle * middle).sum(axis=0)
+    return PatternGrid(along, weights, background.astype(np.float32), middle, bowl, density, graded=not bent)
 
 
 class PatternView(NamedTuple):
@@ -164,8 +167,9 @@ def linearised(
     contrast = amounts[:, 0].astype(np.float32)
     if grid.graded:
         contrast = contrast + amounts[:, 1:3, 0].astype(np.float32) @ grid.middle
+        contrast = contrast + amounts[:, 4].astype(np.float32) * grid.bowl
     if view.displayed and grid.graded:
-        contrast = contrast + amounts[:, 4].astype(np.float32) * (1.0 + 2.0 * model.value)
+        contrast = contrast + amounts[:, 5].astype(np.float32) * (1.0 + 2.0 * model.value)
     # Steps of an alignment are long: what of the slopes looks like background is not trusted.
     slopes = model.slopes if grid.graded else grid.without_background(model.slopes)
     by_px = to_cells.swapaxes(1, 2).astype(np.float32) @ (slopes * contrast).swapaxes(0, 1)
@@ -206,9 +210,10 @@ def _model(
 def _linear_terms(
     model: PatternModel, spread: FloatArray, grid: PatternGrid, cells: int, *, displayed: bool
 ) -> Float32Array:
-    """Linear terms (Q, L, P): the pattern, and where the contrast is graded its gradients and the surface's end.
+    """Linear terms (Q, L, P): the pattern; where the contrast is graded its gradients, and end and bowl of the surface.
 
-    In a picture for a display also what a quadratic function of the counts adds between black and white.
+    The bowl shows through the white cells alone. In a picture for a display also what a quadratic function of the
+    counts adds between black and white.
     """
     if not grid.graded:
         return model.value[:, None]
@@ -218,7 +223,8 @@ def _linear_terms(
     outside = np.array([-_SURFACE_ENDS, cells + _SURFACE_ENDS])
     x, y = (_between(outside, grid.along, np.sqrt(spread[:, axis, axis])) for axis in (0, 1))
     surface = (y[:, :, None] * x[:, None]).reshape(len(spread), 1, -1)
-    terms = [model.value[:, None], graded, surface]
+    bowl = grid.bowl * (1.0 + model.value) + 2.0 * (grid.middle * displaced).sum(axis=1)
+    terms = [model.value[:, None], graded, surface, bowl[:, None]]
     if displayed:
         terms.append((model.value * (1.0 + model.value))[:, None])
     return np.concatenate(terms, axis=1)

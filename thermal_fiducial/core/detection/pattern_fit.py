@@ -44,9 +44,10 @@ _LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.15, (0.5, 2.0)
 # Standard deviation of the blur, in blurs of the optics: the focus. That of the corners from where they are looked for
 # [cells].
 _FOCUS, _START = 0.3, 0.5
-# Parameters of a fit: corners, blur, contrast, background. A fit to something that is not there makes use of fewer of
-# them, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 higher below 8.
-_PARAMETERS, _OF_CHANCE = 16, 9
+# Parameters of a fit: corners, blur, contrast, warm surface, background. A fit to something that is not there makes use
+# of fewer, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 it is higher
+# below 8.
+_PARAMETERS, _OF_CHANCE = 17, 9
 # Least share of the variance that counts as left: no model is better.
 _LEAST = 1e-6
 # Residuals over the noise of a pixel beyond which they are more than noise.
