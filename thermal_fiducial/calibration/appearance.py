@@ -14,6 +14,8 @@ _LEAST_REACH = 2.7
 # Margin of background around a disc in its window [px].
 _GROUND = 4.0
 _MOST_INSET = 0.3
+# Bounds of a disc's radius [steps]; at half a step discs touch.
+_RADIUS_BOUNDS = (0.05, 0.5)
 # Extent of a blurred edge in standard deviations: for the size of a window, and where it has vanished.
 _TAIL, _NOTHING_LEFT = 3.0, 5.0
 # Placeholder position of missing neighbours, out of reach [steps].
@@ -32,10 +34,6 @@ class Appearance(Protocol):
         """Initial inset of squares, or radius of a disc [steps]."""
 
     @property
-    def width_free(self) -> bool:
-        """Whether ``width`` is estimated."""
-
-    @property
     def least_visible(self) -> float:
         """Share of its window that must lie in the image."""
 
@@ -44,6 +42,9 @@ class Appearance(Protocol):
 
     def rows(self, index: IntArray) -> Self:
         """The model at a subset of the points."""
+
+    def of_width(self, width: float) -> Self:
+        """The model for a measured ``width``, by which windows are chosen."""
 
     def reach(self, spacing: FloatArray, blur: FloatArray | None) -> FloatArray:
         """Half widths (P,) [steps] of windows for a point ``spacing`` (P,) [px]; blur (P,) [px] if known."""
@@ -81,7 +82,6 @@ class SquaresMeet:
     parity: FloatArray = field(default_factory=lambda: np.ones(1))
     bent = True
     width = 0.0
-    width_free = True
     least_visible = 0.5
 
     def at(self, nodes: FloatArray, board: FloatArray) -> 'SquaresMeet':
@@ -91,6 +91,10 @@ class SquaresMeet:
     def rows(self, index: IntArray) -> 'SquaresMeet':
         """See :class:`Appearance`."""
         return SquaresMeet(self.parity[index])
+
+    def of_width(self, width: float) -> 'SquaresMeet':
+        """See :class:`Appearance`; the window of a corner does not depend on the inset."""
+        return self
 
     def reach(self, spacing: FloatArray, blur: FloatArray | None) -> FloatArray:
         """See :class:`Appearance`."""
@@ -150,7 +154,7 @@ def _density(x: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Disc:
-    """A disc of a known radius.
+    """A disc of a common radius.
 
     Parameters
     ----------
@@ -161,7 +165,6 @@ class Disc:
     width: float
     others: FloatArray = field(default_factory=lambda: np.zeros((1, 0, 2)))
     bent = False
-    width_free = False
     #: nearly the whole disc, since a part of it does not determine its centre
     least_visible = 0.9
 
@@ -176,6 +179,10 @@ class Disc:
     def rows(self, index: IntArray) -> 'Disc':
         """See :class:`Appearance`."""
         return Disc(self.width, self.others[index])
+
+    def of_width(self, width: float) -> 'Disc':
+        """See :class:`Appearance`."""
+        return Disc(float(np.clip(width, *_RADIUS_BOUNDS)), self.others)
 
     def reach(self, spacing: FloatArray, blur: FloatArray | None) -> FloatArray:
         """See :class:`Appearance`; excludes the next disc except its blur."""
@@ -240,4 +247,6 @@ def _disc(places: FloatArray, blur: FloatArray, width: FloatArray, free: int) ->
         slopes[1] = y_blur * by_blur - y * by_radius
     if free > 2:
         slopes[2] = -inside * density
+    if free > 3:
+        slopes[3] = steps / radius * density
     return np.asarray(ndtr(inside)), slopes

@@ -4,19 +4,21 @@ Both are extrema of the determinant of the Hessian, compared with the noise of t
 threshold on counts is needed, so hot or cold objects in the frame do not matter, and either polarity is found.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
-# Search scales [px], the fast coarse ones first; a fifth to a third of the point spacing is best.
-_SCALES = (17.0, 10.0, 5.8, 3.4, 2.0, 1.2)
-# Ratio of the finer to the coarser of the two scales of a blob search.
-_FINER = 0.6
+# Search scales [px]; a fifth to a third of the point spacing is best.
+_SCALES = (17.0, 10.0, 5.8, 3.4, 2.0, 1.2, 0.72)
+# Scales that are compared: perspective makes the points of a board differ in size, and a strong structure several times
+# as large as a point is another object, behind it or beside it.
+_COMPARED = 3
+# Distance [scales] within which a point is part of a stronger structure: a disc's edge is 1.4 from its centre.
+_APART = 1.5
 # Structures wider than the scale by this factor are suppressed as background.
 _WIDE = 4.0
 _LEAST_SIDE = 8
@@ -40,19 +42,20 @@ class Keypoints:
     pixels : (N, 2)
     hessians : (N, 3) unit vectors of Iuu, Ivv, sqrt(2) Iuv: which way a saddle lies
     response : (N,) determinant of the Hessian, free of scale
+    scale : (N,) index of the search scale, from coarse to fine
     alternate : whether neighbours on a board have opposite Hessians (chessboard corners) or similar ones (discs)
-    look : index of the search scale, and for blobs of the sign
     """
 
     pixels: FloatArray
     hessians: FloatArray
     response: FloatArray
+    scale: IntArray
     alternate: bool
-    look: int = 0
 
-    def rows(self, index: IntArray) -> 'Keypoints':
+    def rows(self, index: IntArray | BoolArray) -> 'Keypoints':
         """Some of them."""
-        return Keypoints(self.pixels[index], self.hessians[index], self.response[index], self.alternate, self.look)
+        parts = self.pixels[index], self.hessians[index], self.response[index], self.scale[index]
+        return Keypoints(*parts, self.alternate)
 
 
 def without_speckles(counts: Counts | Gray) -> Float32Array:
@@ -63,52 +66,58 @@ def without_speckles(counts: Counts | Gray) -> Float32Array:
     return np.where(np.abs(image - median) > _SPECKLE * (high - low) + 1.0, median, image)
 
 
-def saddles(image: Float32Array, first: int = 0) -> Iterator[Keypoints]:
-    """Saddle points of ``image``, one scale after the other, beginning with index ``first``."""
-    for look in _beginning_with(first, len(_SCALES)):
-        yield replace(_extrema(image, _SCALES[look], None), look=look)
+def saddles(image: Float32Array) -> list[Keypoints]:
+    """Saddle points of ``image``, as a list of one."""
+    return [_strongest([_extrema(image, scale, saddle=True) for scale in range(len(_SCALES))])]
 
 
-def blobs(image: Float32Array, first: int = 0) -> Iterator[Keypoints]:
-    """Bright or dark blobs of ``image``, as :func:`saddles`; perspective makes discs of a board differ in size."""
-    for look in _beginning_with(first, 2 * len(_SCALES)):
-        scale, sign = _SCALES[look // 2], -1.0 if look % 2 else 1.0
-        found = _strongest([_extrema(image, size, sign) for size in (scale, _FINER * scale)], scale)
-        yield replace(found, look=look)
+def blobs(image: Float32Array) -> list[Keypoints]:
+    """Bright blobs of ``image``, and dark ones."""
+    found = [_extrema(image, scale, saddle=False) for scale in range(len(_SCALES))]
+    bright = [points.hessians[:, :2].sum(axis=1) < 0.0 for points in found]
+    return [
+        _strongest([points.rows(mask == sign) for points, mask in zip(found, bright, strict=True)])
+        for sign in (True, False)
+    ]
 
 
-def _beginning_with(first: int, count: int) -> list[int]:
-    """Numbers below ``count`` in their order, but for ``first``."""
-    return sorted(range(count), key=lambda number: number != first)
-
-
-def _strongest(found: list[Keypoints], apart: float) -> Keypoints:
-    """Points of several scales; of those closer than ``apart`` [px] the strongest."""
-    pixels, hessians, response = (
-        np.concatenate([getattr(part, name) for part in found]) for name in ('pixels', 'hessians', 'response')
+def _strongest(found: list[Keypoints]) -> Keypoints:
+    """Points of all scales; of those of similar scales closer than the coarser one the strongest."""
+    pixels, hessians, response, scale = (
+        np.concatenate([getattr(part, name) for part in found]) for name in ('pixels', 'hessians', 'response', 'scale')
     )
-    near = cKDTree(pixels).query_ball_point(pixels, apart) if len(pixels) else []
-    kept = np.array([index for index, others in enumerate(near) if response[index] >= response[others].max()], np.int64)
-    every = Keypoints(pixels, hessians, response, found[0].alternate)
-    return every.rows(kept[np.argsort(-response[kept], kind='stable')][:_MOST_POINTS])
+    kept = np.ones(len(pixels), dtype=np.bool_)
+    trees = [cKDTree(part.pixels) if len(part.pixels) else None for part in found]
+    first = np.cumsum([0, *(len(part.pixels) for part in found)])
+    for coarse, tree in enumerate(trees):
+        for fine in range(coarse, min(coarse + _COMPARED + 1, len(found))):
+            other = trees[fine]
+            if tree is None or other is None:
+                continue
+            pairs = tree.sparse_distance_matrix(other, _APART * _SCALES[coarse], output_type='ndarray')
+            one, two = pairs['i'] + first[coarse], pairs['j'] + first[fine]
+            kept[np.where(response[one] < response[two], one, two)[response[one] != response[two]]] = False
+    every = Keypoints(pixels, hessians, response, scale, found[0].alternate)
+    return every.rows(np.flatnonzero(kept)[np.argsort(-response[kept], kind='stable')])
 
 
-def _extrema(image: Float32Array, scale: float, sign: float | None) -> Keypoints:
-    """Saddles (``sign`` None), bright (1) or dark (-1) blobs of ``image`` blurred by ``scale`` [px]."""
-    shrink = max(1, int(scale / 1.5))
+def _extrema(image: Float32Array, scale: int, *, saddle: bool) -> Keypoints:
+    """Saddles or blobs of ``image`` at a search scale, given by its index."""
+    blur = _SCALES[scale]
+    shrink = max(1, int(blur / 1.5))
     size = image.shape[1] // shrink, image.shape[0] // shrink
     if min(size) < _LEAST_SIDE:
-        return Keypoints(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), sign is None)
+        return Keypoints(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64), saddle)
     if shrink > 1:
         image = cv2.resize(image[: size[1] * shrink, : size[0] * shrink], size, interpolation=cv2.INTER_AREA).astype(
             np.float32
         )
-    sigma = scale / shrink
+    sigma = blur / shrink
     smooth = cv2.GaussianBlur(image, (0, 0), sigma)
     smooth = np.asarray(smooth - cv2.GaussianBlur(smooth, (0, 0), _WIDE * sigma), dtype=np.float32)
     uu, vv, uv = (np.asarray(cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.25)) for order in ((2, 0), (0, 2), (1, 1)))
     determinant = uu * vv - uv * uv
-    response = -determinant if sign is None else np.where(-sign * (uu + vv) > 0.0, determinant, 0.0)
+    response = -determinant if saddle else determinant
     # Of a normal distribution a quarter lies within 0.3186 standard deviations.
     noise = max(float(np.percentile(np.abs(uv), 25.0)) / 0.3186, _ROUNDING / sigma**3)
     peak = (response >= cv2.dilate(response, np.ones((3, 3), np.uint8))) & (response > (_NOISE_RATIO * noise) ** 2)
@@ -119,8 +128,8 @@ def _extrema(image: Float32Array, scale: float, sign: float | None) -> Keypoints
     still = np.linalg.norm(step, axis=1) < _STATIONARY * max(sigma, 1.0)
     hessians /= np.linalg.norm(hessians, axis=1, keepdims=True) + 1e-12
     pixels = (np.stack([u, v], axis=1) + step + 0.5) * shrink - 0.5
-    found = Keypoints(pixels, hessians, response[v, u].astype(np.float64) * sigma**4, sign is None)
-    found = found.rows(np.flatnonzero(still))
+    strength = response[v, u].astype(np.float64) * sigma**4
+    found = Keypoints(pixels, hessians, strength, np.full(len(pixels), scale), saddle).rows(np.flatnonzero(still))
     return found.rows(np.argsort(-found.response, kind='stable')[:_MOST_POINTS])
 
 

@@ -24,9 +24,11 @@ Node = tuple[int, int]
 #: A keypoint, its two neighbours along one axis and the two along another.
 Seed = tuple[int, int, int, int, int]
 
-_NEIGHBOURS, _MOST_SEEDS = 12, 40
+_NEIGHBOURS, _MOST_SEEDS = 12, 20
 # Least likeness (cosine) of the Hessians of neighbours, but for their sign.
 _LIKE = 0.5
+# Largest ratio of the responses of neighbours, which is that of their contrasts squared.
+_STRONGER = 16.0
 # Deviation from where the grid predicts a point, in steps of the grid. Points of a board deviate by a tenth or less on
 # average, whatever the lens; those of noise by as much as is allowed.
 _TOLERANCE, _SEED_TOLERANCE, _ORDERLY, _ENOUGH = 0.3, 0.25, 0.15, 6
@@ -43,14 +45,12 @@ class BoardPoints:
     points : (N,) their index on the board
     pixels : (N, 2) where they are, to a pixel or a tenth of their spacing
     beyond_nodes, beyond_pixels : (B, 2) grid points outside the board
-    look : search index of the keypoints, see :class:`Keypoints`
     """
 
     points: IntArray
     pixels: FloatArray
     beyond_nodes: IntArray
     beyond_pixels: FloatArray
-    look: int = 0
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,11 @@ class LargerGrid:
     ----------
     nodes, pixels : (L, 2)
     covered : number of board points in it
-    look : see :class:`BoardPoints`
     """
 
     nodes: IntArray
     pixels: FloatArray
     covered: int
-    look: int
 
 
 def find_board(views: Iterable[Keypoints], board: BoardNodes) -> tuple[BoardPoints | GridRefusal, LargerGrid | None]:
@@ -78,20 +76,20 @@ def find_board(views: Iterable[Keypoints], board: BoardNodes) -> tuple[BoardPoin
     best: BoardPoints | None = None
     refusal, weightiest = GridRefusal('no regular grid of points'), 0.0
     larger: LargerGrid | None = None
-    for keypoints, grid in ((points, grid) for points in views for grid in Grower(points).grids()):
-        pixels = keypoints.pixels[list(grid.values())]
+    growers = sorted(map(Grower, views), key=Grower.total_contrast, reverse=True)
+    for grower, grid in ((source, grid) for source in growers for grid in source.grids()):
+        pixels = grower.pixels[list(grid.values())]
         nodes = _facing(np.array(list(grid), dtype=np.int64), pixels)
         placed = board.place(nodes)
         if isinstance(placed, GridRefusal):
             # Among many points that belong to no board a large grid may be chance: its share of them counts too.
-            weight = len(grid) ** 2 / len(keypoints.pixels)
+            weight = len(grid) ** 2 / len(grower.pixels)
             if weight > weightiest:
                 refusal, weightiest = placed, weight
             if placed.covered > (0 if larger is None else larger.covered):
-                larger = LargerGrid(nodes, pixels, placed.covered, keypoints.look)
+                larger = LargerGrid(nodes, pixels, placed.covered)
         elif best is None or len(placed.points) > len(best.points):
-            beyond = placed.beyond_nodes, pixels[placed.beyond]
-            best = BoardPoints(placed.points, pixels[placed.rows], *beyond, look=keypoints.look)
+            best = BoardPoints(placed.points, pixels[placed.rows], placed.beyond_nodes, pixels[placed.beyond])
             if len(best.points) == len(board.nodes):
                 break
     if best is not None and larger is not None and larger.covered <= len(best.points):
@@ -107,60 +105,61 @@ def _facing(nodes: IntArray, pixels: FloatArray) -> IntArray:
 
 
 class Grower:
-    """Grows grids of keypoints."""
+    """Grows grids of keypoints.
+
+    Parameters
+    ----------
+    keypoints : (N) of any scales
+
+    Attributes
+    ----------
+    pixels : (N, 2)
+    seeds : strongest first
+    """
 
     def __init__(self, keypoints: Keypoints) -> None:
-        self._pixels, self._hessians = keypoints.pixels, keypoints.hessians
-        self._sign = -1.0 if keypoints.alternate else 1.0
-        self._tree = cKDTree(self._pixels)
+        self.pixels, self._hessians = keypoints.pixels, keypoints.hessians
+        self._scale, self._strength = keypoints.scale, np.log(keypoints.response)
+        self._similar = {scale: _similar_scales(keypoints, scale) for scale in np.unique(keypoints.scale).tolist()}
+        self._trees = {scale: cKDTree(self.pixels[similar]) for scale, similar in self._similar.items()}
+        self.seeds: list[Seed] = sorted(
+            tuple(seed) for scale in self._similar for seed in _seeds(keypoints, scale).tolist()
+        )
+
+    def total_contrast(self) -> float:
+        """Of the seeds; responses are contrasts squared."""
+        return float(np.exp(0.5 * self._strength[[seed[0] for seed in self.seeds]]).sum())
 
     def grids(self) -> Iterator[dict[Node, int]]:
         """Keypoints (their index) by their place in a grid, strongest seeds first; those of a grid seed no other."""
         taken: set[int] = set()
         tried = 0
-        for seed in self._seeds():
+        for seed in self.seeds:
             if tried == _MOST_SEEDS:
                 return
             if seed[0] not in taken:
                 tried += 1
-                grid = self._grow(seed)
+                grid, orderly = self._grow(seed)
                 taken.update(grid.values())
-                yield grid
+                if orderly:
+                    yield grid
 
-    def _seeds(self) -> Iterator[Seed]:
-        """Points with like neighbours on four sides, the nearest such."""
-        if len(self._pixels) < 5:
-            return
-        _, near = self._tree.query(self._pixels, min(_NEIGHBOURS + 1, len(self._pixels)))
-        near = near[:, 1:]
-        offset = self._pixels[near] - self._pixels[:, None]
-        length = np.linalg.norm(offset, axis=-1)
-        like = self._sign * np.einsum('nki,ni->nk', self._hessians[near], self._hessians) > _LIKE
-        closing = np.linalg.norm(offset[:, :, None] + offset[:, None], axis=-1)
-        opposite = closing < _SEED_TOLERANCE * np.minimum(length[:, :, None], length[:, None])
-        opposite &= like[:, :, None] & like[:, None]
-        for index in np.flatnonzero(opposite.any(axis=(1, 2))).tolist():
-            pairs = [(j, k) for j, k in np.argwhere(opposite[index]).tolist() if j < k]
-            unit = offset[index] / length[index][:, None]
-            along = unit[pairs[0][0]]
-            for pair in pairs[1:]:
-                if abs(along[0] * unit[pair[0], 1] - along[1] * unit[pair[0], 0]) > _LEAST_SINE:
-                    first, second, third, fourth = near[index, [*pairs[0], *pair]].tolist()
-                    yield index, first, second, third, fourth
-                    break
+    def _grow(self, seed: Seed) -> tuple[dict[Node, int], bool]:
+        """Grid from a seed: first what is next to it, then over gaps of one point; and whether it is orderly.
 
-    def _grow(self, seed: Seed) -> dict[Node, int]:
-        """Grid from a seed: first what is next to it, then over gaps of one point; given up where it is no grid."""
+        Points of noise lie anywhere within the tolerance: their grid is given up.
+        """
         grid: dict[Node, int] = dict(zip(((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)), seed, strict=True))
         support: Counter[Node] = Counter()
         for node in grid:
             support.update(_supported(node))
         asked: dict[Node, int] = {}
         off: list[float] = []
-        growing = True
-        while growing and (len(off) < _ENOUGH or np.mean(off) < _ORDERLY):
+        growing = orderly = True
+        while growing and orderly:
             growing = any(self._add(grid, reach, support, asked, off) for reach in (1, 2))
-        return grid
+            orderly = len(off) < _ENOUGH or bool(np.mean(off) < _ORDERLY)
+        return grid, orderly
 
     def _add(
         self, grid: dict[Node, int], reach: int, support: Counter[Node], asked: dict[Node, int], off: list[float]
@@ -177,13 +176,15 @@ class Grower:
         if not places:
             return False
         asked.update((node, support[node]) for node in places)
-        nodes, pixels = np.array(list(grid), dtype=np.float64), self._pixels[list(grid.values())]
+        nodes, pixels = np.array(list(grid), dtype=np.float64), self.pixels[list(grid.values())]
         surfaces = local_surfaces(nodes, pixels, np.array(places, dtype=np.float64))
+        scale = int(self._scale[grid[0, 0]])
+        similar, tree = self._similar[scale], self._trees[scale]
         steps, used, before = surfaces.steps, set(grid.values()), len(grid)
         rows = np.flatnonzero(surfaces.determined)
         radii = _TOLERANCE * np.linalg.norm(steps[rows], axis=1).max(axis=1, initial=0.0)
-        for row, nearby in zip(rows.tolist(), self._tree.query_ball_point(surfaces.centres[rows], radii), strict=True):
-            free = [index for index in nearby if index not in used]
+        for row, nearby in zip(rows.tolist(), tree.query_ball_point(surfaces.centres[rows], radii), strict=True):
+            free = [index for index in similar[nearby].tolist() if index not in used]
             found = self._next(grid, places[row], free, surfaces.centres[row], steps[row]) if free else None
             if found is not None:
                 grid[places[row]] = found[0]
@@ -201,17 +202,53 @@ class Grower:
         ----------
         steps : (2, 2) to the next places, by columns [px]
         """
-        off = np.linalg.norm(np.linalg.solve(steps, (self._pixels[nearby] - centre).T), axis=0)
+        off = np.linalg.norm(np.linalg.solve(steps, (self.pixels[nearby] - centre).T), axis=0)
         for away, index in sorted(zip(off.tolist(), nearby, strict=True)):
             if away <= _TOLERANCE and self._fits(grid, node, index):
                 return index, away
         return None
 
     def _fits(self, grid: dict[Node, int], node: Node, index: int) -> bool:
-        """Whether the Hessian is like those of the neighbours; of any sign, for contrast may reverse."""
+        """Whether Hessian and contrast are like those of a neighbour; of any sign, for contrast may reverse."""
         neighbours = [grid[n] for n in _around(node, 1) if n in grid]
-        likeness = np.abs(self._hessians[neighbours] @ self._hessians[index])
-        return len(neighbours) == 0 or float(likeness.max()) > _LIKE
+        alike = np.abs(self._hessians[neighbours] @ self._hessians[index]) > _LIKE
+        alike &= np.abs(self._strength[neighbours] - self._strength[index]) < np.log(_STRONGER)
+        return len(neighbours) == 0 or bool(alike.any())
+
+
+def _similar_scales(keypoints: Keypoints, scale: int) -> IntArray:
+    """Keypoints of a search scale, the next finer and the next coarser one: perspective spreads a board over them."""
+    return np.flatnonzero(np.abs(keypoints.scale - scale) <= 1)
+
+
+def _seeds(keypoints: Keypoints, scale: int) -> IntArray:
+    """Seeds (S, 5) of a search scale, see :data:`Seed`: the nearest like neighbours of similar scales on four sides."""
+    similar = _similar_scales(keypoints, scale)
+    own = np.flatnonzero(keypoints.scale == scale)
+    if len(similar) < 5:
+        return np.zeros((0, 5), np.int64)
+    pixels, hessians, strength = keypoints.pixels, keypoints.hessians, np.log(keypoints.response)
+    _, near = cKDTree(pixels[similar]).query(pixels[own], min(_NEIGHBOURS + 1, len(similar)))
+    near = similar[near[:, 1:]]
+    offset = pixels[near] - pixels[own][:, None]
+    length = np.linalg.norm(offset, axis=-1)
+    sign = -1.0 if keypoints.alternate else 1.0
+    like = sign * np.einsum('nki,ni->nk', hessians[near], hessians[own]) > _LIKE
+    like &= np.abs(strength[near] - strength[own][:, None]) < np.log(_STRONGER)
+    closing = np.linalg.norm(offset[:, :, None] + offset[:, None], axis=-1)
+    opposite = closing < _SEED_TOLERANCE * np.minimum(length[:, :, None], length[:, None])
+    opposite &= like[:, :, None] & like[:, None]
+    # Pairs of opposite neighbours, the nearest first; the second pair is the next that runs in another direction.
+    row, one, other = np.nonzero(np.triu(opposite))
+    unit = offset[row, one] / length[row, one][:, None]
+    begins = np.searchsorted(row, row)
+    across = np.abs(unit[begins, 0] * unit[:, 1] - unit[begins, 1] * unit[:, 0]) > _LEAST_SINE
+    second = np.flatnonzero(across)
+    second = second[np.unique(row[second], return_index=True)[1]]
+    first = begins[second]
+    return np.column_stack(
+        [own[row[second]], *(near[row[pair], end[pair]] for pair in (first, second) for end in (one, other))]
+    )
 
 
 def _around(node: Node, reach: int) -> list[Node]:

@@ -22,19 +22,28 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 
 # Initial blur in steps of the grid, and its lower limit in pixels.
 _BLUR, _LEAST_BLUR = 0.06, 0.8
-# Most steps of a fit, rejected ones included; length of a step at convergence, in the last round and before; initial
-# damping, and damping at which the fit gives up.
-_MOST_STEPS, _CONVERGED_PX, _NEARLY_PX, _DAMPING, _MOST_DAMPED = 40, 1e-3, 1e-2, 1e-3, 1e3
+# Most steps of a fit, rejected ones included; length of the last step, in the last round and before, whose error is a
+# tenth of it; initial damping, and damping at which the fit gives up.
+_MOST_STEPS, _CONVERGED_PX, _NEARLY_PX, _DAMPING, _MOST_DAMPED = 40, 5e-3, 3e-2, 1e-3, 1e3
 # A point is lost when its standard deviation exceeds this [px], when the fit moves further than this from the start
 # [steps], or when its contrast relative to that predicted from the neighbours is outside these limits.
 _MOST_SIGMA_PX, _MOST_MOVE, _CONTRAST = 0.5, 0.25, (0.6, 1.6)
 _LEAST_POINTS = 6
 # Number of points, spread over the board, for blur and width; each determines them to a few per cent.
 _SAMPLE = 48
+# Most samples, since a width far from the described one takes another window, and relative change that takes none.
+_MOST_SAMPLES, _SAME_WIDTH = 4, 0.05
 # Number of linear parameters of a fit: background (level and slope) and contrast.
 _LINEAR = 4
 # Points and pixels per batch: enough for long rows, few enough for a processor's cache.
-_POINTS_AT_A_TIME, _PIXELS_AT_A_TIME = 48, 8000
+_POINTS_AT_A_TIME, _PIXELS_AT_A_TIME = 160, 30000
+
+
+class Refined(NamedTuple):
+    """Points (N, 2) of a board, NaN where lost, and the width of its pattern, see :class:`Appearance` [steps]."""
+
+    pixels: FloatArray
+    width: float
 
 
 def refine(
@@ -45,8 +54,8 @@ def refine(
     appearance: Appearance,
     *,
     grid: BoolArray | None = None,
-) -> FloatArray:
-    """Refined points (N, 2) of a board, NaN where lost.
+) -> Refined:
+    """Refine the points of a board.
 
     Parameters
     ----------
@@ -59,20 +68,25 @@ def refine(
     every = np.arange(len(nodes))
     grid = np.ones(len(nodes), dtype=np.bool_) if grid is None else grid
     some = np.sort(np.random.default_rng(0).permutation(np.flatnonzero(grid))[:_SAMPLE])
-    alone = _round(image, nodes, pixels, appearance, some, grid, None, None)
-    found = np.isfinite(alone.contrast)
-    if np.sum(found) < _LEAST_POINTS:
-        return np.full_like(pixels, np.nan)
+    for _ in range(_MOST_SAMPLES):
+        alone = _round(image, nodes, pixels, appearance, some, grid, None, None)
+        found = np.isfinite(alone.contrast)
+        if np.sum(found) < _LEAST_POINTS:
+            return Refined(np.full_like(pixels, np.nan), appearance.width)
+        width = float(np.median(alone.width[found]))
+        before, appearance = appearance.width, appearance.of_width(width)
+        if abs(appearance.width - before) < _SAME_WIDTH * before:
+            break
     log_blur = _plane(nodes[found], alone.log_blur[found], nodes)
-    shared = _Shared(log_blur, np.full(len(nodes), np.median(alone.width[found])))
+    shared = _Shared(log_blur, np.full(len(nodes), width))
     pixels = _next_starts(nodes, pixels, alone.pixels, some, grid)
     alike = _round(image, nodes, pixels, appearance, every, grid, shared, None)
     if np.sum(np.isfinite(alike.contrast)) < _LEAST_POINTS:
-        return np.full_like(pixels, np.nan)
+        return Refined(np.full_like(pixels, np.nan), width)
     pixels = _next_starts(nodes, pixels, alike.pixels, every, grid)
     refined = _round(image, nodes, pixels, appearance, every, grid, shared, alike.contrast)
     enough = np.sum(np.isfinite(refined.contrast)) >= _LEAST_POINTS
-    return refined.pixels if enough else np.full_like(pixels, np.nan)
+    return Refined(refined.pixels if enough else np.full_like(pixels, np.nan), width)
 
 
 def _next_starts(
@@ -156,7 +170,7 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
     if shared is None:
         parameters[:, 2] = np.log(np.maximum(_LEAST_BLUR, _BLUR / windows.scale.max(axis=1)))
         parameters[:, 3] = windows.appearance.width
-        free = 4 if windows.appearance.width_free else 3
+        free = 4
     else:
         parameters[:, 2], parameters[:, 3] = shared
         free = 2
@@ -166,7 +180,7 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
     moving = np.arange(len(parameters))
     enough = _CONVERGED_PX if with_contrast else _NEARLY_PX
     for _ in range(_MOST_STEPS):
-        step = np.pad(state.rows(moving).step(damping[moving]), ((0, 0), (0, 4 - free)))
+        step = state.rows(moving).step(damping[moving])
         short = np.abs(step[:, :2]).max(axis=1) < enough
         # Too short a step for the cost to be evaluated again.
         state.parameters[moving[short]] += step[short]
@@ -177,7 +191,7 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
         better = tried.cost <= state.cost[moving]
         state.put(moving[better], tried.rows(np.flatnonzero(better)))
         damping[moving] *= np.where(better, 0.1, 10.0)
-        moving = moving[damping[moving] < _MOST_DAMPED]
+        moving = moving[(damping[moving] < _MOST_DAMPED) & (_moved(windows, state)[moving] < 2.0 * _MOST_MOVE)]
         if len(moving) == 0:
             break
     lost = ~_well_determined(windows, state)
@@ -191,10 +205,16 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
 def _well_determined(windows: PointWindows, state: '_CornerState') -> BoolArray:
     """Mask (P,) of the fits with a small standard deviation that end near their start."""
     freedom = np.maximum(1.0, (windows.weight**2).sum(axis=1) - state.free - _LINEAR)
-    covariance = np.linalg.pinv(state.normal, hermitian=True)[:, :2, :2]
-    variance = state.cost / freedom * np.trace(covariance, axis1=1, axis2=2)
-    moved = np.linalg.norm((windows.inverse @ state.parameters[:, :2, None])[..., 0], axis=1)
-    return np.asarray((variance < _MOST_SIGMA_PX**2) & (moved < _MOST_MOVE))
+    # A ridge in place of the zeros of a fit without contrast, which determines nothing.
+    ridge = 1e-12 * np.trace(state.normal, axis1=1, axis2=2) + 1e-30
+    covariance = np.linalg.inv(state.normal + ridge[:, None, None] * np.eye(state.free + 1))
+    variance = state.cost / freedom * (covariance[:, 0, 0] + covariance[:, 1, 1])
+    return np.asarray((variance < _MOST_SIGMA_PX**2) & (_moved(windows, state) < _MOST_MOVE))
+
+
+def _moved(windows: PointWindows, state: '_CornerState') -> FloatArray:
+    """Distances (P,) from the starts [steps]."""
+    return np.asarray(np.linalg.norm((windows.inverse @ state.parameters[:, :2, None])[..., 0], axis=1))
 
 
 @dataclass(frozen=True)
@@ -219,20 +239,25 @@ class _CornerState:
     @classmethod
     def at(cls, windows: PointWindows, parameters: FloatArray, free: int) -> '_CornerState':
         """State at ``parameters``."""
-        shape, slopes = windows.pattern(parameters, free)
-        contrast = (shape * windows.counts).sum(axis=1) / ((shape * shape).sum(axis=1) + 1e-12)
-        residual = windows.counts - contrast[:, None] * shape
-        J = np.concatenate([slopes * contrast[:, None, None], shape[..., None]], axis=2)
-        transposed = J.swapaxes(1, 2)
-        gradient = (transposed @ residual[..., None])[..., 0]
-        return cls(free, parameters, contrast, (residual * residual).sum(axis=1), transposed @ J, gradient)
+        among, with_counts = windows.products(parameters, free)
+        size = among[:, 0, 0] + 1e-12
+        contrast = with_counts[:, 0] / size
+        cost = (windows.counts**2).sum(axis=1) - with_counts[:, 0] ** 2 / size
+        # The derivatives of the pattern by the parameters, times the contrast, and the pattern itself.
+        order, scale = [*range(1, 1 + free), 0], np.ones((len(size), free + 1))
+        scale[:, :free] = contrast[:, None]
+        normal = among[:, order][:, :, order] * scale[:, :, None] * scale[:, None]
+        gradient = scale * (with_counts - contrast[:, None] * among[:, 0])[:, order]
+        return cls(free, parameters, contrast, cost, normal, gradient)
 
     def step(self, damping: FloatArray) -> FloatArray:
-        """Damped step (P, free) downhill."""
+        """Damped step (P, 4) downhill."""
         damped = self.normal.copy()
         diagonal = np.arange(self.free + 1)
         damped[:, diagonal, diagonal] += damping[:, None] * (damped[:, diagonal, diagonal] + 1e-9)
-        return np.asarray(np.linalg.solve(damped, self.gradient[..., None])[:, : self.free, 0])
+        step = np.zeros_like(self.parameters)
+        step[:, : self.free] = np.linalg.solve(damped, self.gradient[..., None])[:, : self.free, 0]
+        return step
 
     def rows(self, index: IntArray) -> '_CornerState':
         """The state of a subset of the points."""

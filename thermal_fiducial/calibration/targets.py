@@ -21,6 +21,9 @@ from thermal_fiducial.errors import InputError
 _APART_NS = 10_000_000_000
 # Number of similar discs beyond the board that prove a larger grid; one or two may be clutter.
 _ANOTHER_GRID = 3
+# Largest deviation of the circles' width from the described one. Blur of half a radius lowers what is measured by 8 %;
+# the radius enters where the middle of an image of a circle lies, with its square.
+_OF_ITS_WIDTH = 0.2
 # Smallest share of matching points of a grid that is reported as incomplete; below, it is another pattern.
 _ALIKE = 0.5
 
@@ -67,7 +70,7 @@ class Detector(Protocol):
 
 
 class Chessboard:
-    """A chessboard of warm and cold squares; the search starts with the scale of the previous frame.
+    """A chessboard of warm and cold squares.
 
     Parameters
     ----------
@@ -85,18 +88,15 @@ class Chessboard:
         self._board = BoardNodes(nodes)
         # Outer corners of the outermost squares may look like points, one for every other square.
         self._line = min(columns, rows)
-        self._look = 0
 
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
         """See :class:`Target`."""
         image = without_speckles(counts)
-        keypoints = saddles(image, self._look)
-        sighting, self._look = _sighting(image, keypoints, self._board, self.points, SquaresMeet(), self._line)
-        return sighting
+        return _sighting(image, saddles(image), self._board, self.points, SquaresMeet(), self._line)
 
 
 class CircleGrid:
-    """A grid of round holes or spots; the search starts with the scale of the previous frame.
+    """A grid of round holes or spots.
 
     Parameters
     ----------
@@ -136,14 +136,11 @@ class CircleGrid:
         self._board = BoardNodes(nodes[there], nodes[~there])
         self._disc = Disc(0.5 * diameter / pitch)
         self.radius = 0.5 * diameter
-        self._look = 0
 
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
         """See :class:`Target`."""
         image = without_speckles(counts)
-        keypoints = blobs(image, self._look)
-        sighting, self._look = _sighting(image, keypoints, self._board, self.points, self._disc, _ANOTHER_GRID)
-        return sighting
+        return _sighting(image, blobs(image), self._board, self.points, self._disc, _ANOTHER_GRID)
 
 
 def _circles(places: IntArray, spacing: float, longer: int, *, asymmetric: bool) -> tuple[IntArray, FloatArray]:
@@ -175,8 +172,8 @@ def _sighting(
     points: FloatArray,
     appearance: Appearance,
     another: int,
-) -> tuple[Sighting, int]:
-    """Find a board, refine its points to a few hundredths of a pixel; also returns the search index that found it.
+) -> Sighting:
+    """Find a board and refine its points to a few hundredths of a pixel.
 
     With at least ``another`` similar points beyond it, it is another board.
     """
@@ -186,13 +183,13 @@ def _sighting(
         good = np.isfinite(of_larger[:, 0])
         if larger is None or np.sum(good) < _ALIKE * len(good):
             raise BoardNotFound(found.reason)
-        return _within(larger.nodes[good], of_larger[good], board, points, another), larger.look
+        return _within(larger.nodes[good], of_larger[good], board, points, another)
     # Points beyond the board are refined too, which rejects clutter but not the points of another board.
     count, beside = len(found.points), len(found.beyond_nodes)
     beside = beside if beside >= another else 0
     nodes = np.concatenate([board.nodes[found.points], found.beyond_nodes[:beside]]).astype(np.float64)
     starts = np.concatenate([found.pixels, found.beyond_pixels[:beside]])
-    pixels = refine(
+    pixels, width = refine(
         image, nodes, starts, board.nodes.astype(np.float64), appearance, grid=np.arange(len(nodes)) < count
     )
     good = np.isfinite(pixels[:, 0])
@@ -201,6 +198,8 @@ def _sighting(
     beyond = max(int(np.sum(good[count:])), alike - len(points))
     if beyond >= another:
         raise BoardNotFound(goes_on(beyond))
+    if abs(width - appearance.width) > _OF_ITS_WIDTH * appearance.width > 0.0:
+        raise BoardNotFound(f'the circles are {width / appearance.width:.2f} times as wide as described')
     kept = found.points[good[:count]]
     if len(kept) < _ALIKE * count:
         raise BoardNotFound(f'{len(kept)} of {count} points look as described: out of focus, or of other sizes')
@@ -208,13 +207,13 @@ def _sighting(
     placed = board.place(board.nodes[kept])
     if isinstance(placed, GridRefusal):
         raise BoardNotFound(placed.reason)
-    return Sighting(points[kept], pixels[:count][good[:count]]), found.look
+    return Sighting(points[kept], pixels[:count][good[:count]])
 
 
 def _refined(image: Float32Array, larger: LargerGrid, appearance: Appearance) -> FloatArray:
     """Points (L, 2) of a larger grid, NaN where nothing looks like a point of the board."""
     nodes = larger.nodes.astype(np.float64)
-    return refine(image, nodes, larger.pixels, nodes, appearance)
+    return refine(image, nodes, larger.pixels, nodes, appearance).pixels
 
 
 def _within(nodes: IntArray, pixels: FloatArray, board: BoardNodes, points: FloatArray, another: int) -> Sighting:

@@ -9,7 +9,7 @@ from thermal_fiducial.calibration.surface import Surfaces
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # Smallest spacing of points for a sub-pixel fit [px].
-_LEAST_SPACING = 5.0
+_LEAST_SPACING = 4.0
 _LEAST_PIXELS = 12
 # Bounds of the blur [px].
 _BLUR_BOUNDS = (0.2, 60.0)
@@ -55,8 +55,11 @@ class PointWindows:
         parts = {name: values[index] for name, values in vars(self).items() if name != 'appearance'}
         return PointWindows(self.appearance.rows(index), **parts)
 
-    def pattern(self, parameters: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
-        """Pattern (P, N), weighted and without background, and its derivatives (P, N, free) by the first parameters.
+    def products(self, parameters: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
+        """Inner products of the pattern and its derivatives by the first parameters, without their background.
+
+        Returns (P, 1 + free, 1 + free) with each other and (P, 1 + free) with the counts. A fit needs no more of them,
+        and the background of the products takes far less than that of each pixel.
 
         Parameters
         ----------
@@ -66,16 +69,19 @@ class PointWindows:
         log_blur = parameters[:, 2, None]
         low, high = np.log(_BLUR_BOUNDS)
         values, slopes = self.appearance.shape(places, self._blur(parameters), parameters[:, 3], free)
-        slopes[2:3] *= (low < log_blur) & (log_blur < high)
-        columns = np.empty((*values.shape, 1 + free))
-        columns[..., 0] = values + self.beside
+        rows = np.empty((len(values), 1 + free, values.shape[1]))
+        np.add(values, self.beside, out=rows[:, 0])
         for pixel_axis in range(2):
             towards = self.inverse[:, :, pixel_axis, None]
-            columns[..., 1 + pixel_axis] = -slopes[0] * towards[:, 0] - slopes[1] * towards[:, 1]
-        columns[..., 3:] = np.moveaxis(slopes[2:], 0, -1)
-        columns *= (self.weight * self.expected)[..., None]
-        columns -= self.ground @ (self.ground.swapaxes(1, 2) @ columns)
-        return columns[..., 0], columns[..., 1:]
+            rows[:, 1 + pixel_axis] = -slopes[0] * towards[:, 0] - slopes[1] * towards[:, 1]
+        if free > 2:
+            rows[:, 3] = slopes[2] * ((low < log_blur) & (log_blur < high))
+        if free > 3:
+            rows[:, 4] = slopes[3]
+        rows *= (self.weight * self.expected)[:, None]
+        background = rows @ self.ground
+        among = rows @ rows.swapaxes(1, 2) - background @ background.swapaxes(1, 2)
+        return among, (rows @ self.counts[..., None])[..., 0]
 
     def with_neighbours_held(self, parameters: FloatArray) -> 'PointWindows':
         """Windows for fits of places alone, with the neighbours fixed at their grid positions."""
@@ -109,11 +115,11 @@ def windows_around(
     whole = np.pi * reach**2 * np.abs(np.linalg.det(surfaces.steps))
     count = inside.sum(axis=1)
     enough = np.flatnonzero(count >= np.maximum(_LEAST_PIXELS, appearance.least_visible * whole))
-    # Sort the pixels of the window to the front, in their order.
-    order = np.argsort(~inside[enough], axis=1, kind='stable')[:, : count[enough].max(initial=0)]
-    weight = np.sqrt(np.where(inside, 1.0 - away, 0.0))[enough[:, None], order]
-    offsets, places, pixels = (values[enough[:, None], order] for values in (offsets, places, pixels))
-    v, u = np.where(weight[..., None] > 0.0, pixels, 0.0)[..., ::-1].astype(np.int64).transpose(2, 0, 1)
+    weight, offsets, places, pixels = (
+        _packed(inside[enough], values[enough])
+        for values in (np.sqrt(np.maximum(1.0 - away, 0.0)), offsets, places, pixels)
+    )
+    v, u = pixels[..., ::-1].astype(np.int64).transpose(2, 0, 1)
     counts = image[v, u].astype(np.float64) * weight
     ground = np.linalg.qr(np.concatenate([np.ones_like(offsets[..., :1]), offsets], axis=2) * weight[..., None])[0]
     counts -= (ground @ (ground.swapaxes(1, 2) @ counts[..., None]))[..., 0]
@@ -130,6 +136,20 @@ def windows_around(
         expected=np.ones_like(weight),
         beside=np.zeros_like(weight),
     )
+
+
+def _packed(inside: BoolArray, values: FloatArray) -> FloatArray:
+    """Values (P, N, ...) of the pixels ``inside`` (P, M) of each window, in their order, and zeros behind them.
+
+    Parameters
+    ----------
+    values : (P, M, ...)
+    """
+    point, pixel = np.nonzero(inside)
+    column = (np.cumsum(inside, axis=1) - 1)[point, pixel]
+    packed = np.zeros((len(inside), inside.sum(axis=1).max(initial=0), *values.shape[2:]))
+    packed[point, column] = values[point, pixel]
+    return packed
 
 
 def _box(image: Float32Array, starts: FloatArray, extent: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from support.heated_boards import Heat, picture
 
-from thermal_fiducial.calibration import targets
 from thermal_fiducial.calibration.appearance import Disc
+from thermal_fiducial.calibration.lattice import Grower
 from thermal_fiducial.calibration.placement import BoardNodes, GridRefusal
 from thermal_fiducial.calibration.targets import BoardNotFound, Chessboard, CircleGrid
 from thermal_fiducial.core.geometry.camera import Camera
@@ -228,15 +228,34 @@ def test_clutter_that_continues_the_grid_makes_no_larger_board():
     assert errors(sighting, points, truth).max() < 0.03
 
 
-def test_a_board_is_looked_for_first_as_it_was_found_before(monkeypatch):
-    target, looks = CircleGrid(7, 5, 1.0, 0.54, asymmetric=False), []
-    blobs = targets.blobs
-    monkeypatch.setattr(targets, 'blobs', lambda image, first: (looks.append(k.look) or k for k in blobs(image, first)))
-    for seed in (3, 5):
-        counts, _ = picture(target.points[:, :2], Heat(), np.random.default_rng(seed), radius=0.27, fill=SMALL)
-        assert len(target.find(counts, GUESS).points) == 35
-    assert len(looks) > 2
-    assert looks[-1] == looks[-2]
+@pytest.mark.parametrize('contrast', [6.0, -6.0])
+def test_the_first_grid_that_is_grown_is_the_board(monkeypatch, contrast):
+    """Neither the gaps between dots, nor edges of dots at finer scales are tried before the dots."""
+    grown, grow = [], Grower._grow  # noqa: SLF001  (no public call grows one grid)
+    monkeypatch.setattr(Grower, '_grow', lambda self, seed: grown.append(seed) or grow(self, seed))
+    heat = Heat(contrast=contrast)
+    counts, _ = picture(SYMMETRIC.points[:, :2], heat, np.random.default_rng(3), radius=0.27, fill=SMALL)
+    assert len(SYMMETRIC.find(counts, GUESS).points) == 35
+    assert len(grown) == 1
+
+
+def test_dots_of_three_pixels_are_found():
+    """Rows are 4 to 6 px apart, which five of seventeen views of a far board were refused for."""
+    target = CircleGrid(16, 10, 1.0, 0.7, asymmetric=False)
+    size = {'radius': 0.35, 'width': 384, 'height': 288}
+    shares, error = look(target, Heat(), (1, 2), fill=0.26, **size)
+    assert np.all(shares >= 0.9)
+    # Measured 0.05 px: a hundredth of a step.
+    assert np.sqrt(np.mean(error**2)) < 0.1
+
+
+def test_dots_close_together_are_found_under_perspective():
+    """Small dots at one end, large ones at the other, gaps of a fifth of a step: four of ten were refused."""
+    target = CircleGrid(16, 10, 1.0, 1.16, longer=1)
+    size = {'radius': 0.58, 'width': 384, 'height': 288}
+    shares, error = look(target, Heat(), (1, 4), fill=0.85, **size)
+    assert np.all(shares >= 0.95)
+    assert np.sqrt(np.mean(error**2)) < 0.1
 
 
 def test_the_grid_at_another_scale_reveals_a_larger_board():
@@ -276,11 +295,21 @@ def test_unusable_circle_grids(arguments, words):
         CircleGrid(**({'columns': 4, 'rows': 11, 'spacing': 0.03, 'diameter': 0.024} | arguments))
 
 
-def test_circles_of_another_diameter_are_named_as_such():
-    described = CircleGrid(7, 5, 1.0, 0.2, asymmetric=False)
+@pytest.mark.parametrize(('diameter', 'words'), [(0.2, '2.7[0-9]'), (0.31, '1.7[0-9]'), (0.8, '0.6[0-9]')])
+def test_circles_of_another_diameter_are_named_as_such(diameter, words):
+    described = CircleGrid(7, 5, 1.0, diameter, asymmetric=False)
     counts, _ = picture(SYMMETRIC.points[:, :2], Heat(), np.random.default_rng(3), radius=0.27, fill=SMALL)
-    with pytest.raises(BoardNotFound, match=r'of 35 points look as described: out of focus, or of other sizes'):
+    with pytest.raises(BoardNotFound, match=f'the circles are {words} times as wide as described'):
         described.find(counts, GUESS)
+
+
+def test_a_diameter_a_tenth_off_moves_no_point():
+    """Heat spreads, paint bleeds: the width is measured, and the described one only has to be near it."""
+    counts, truth = picture(SYMMETRIC.points[:, :2], Heat(), np.random.default_rng(3), radius=0.27, fill=SMALL)
+    for diameter in (0.48, 0.6):
+        sighting = CircleGrid(7, 5, 1.0, diameter, asymmetric=False).find(counts, GUESS)
+        # As of the true diameter.
+        assert np.sqrt(np.mean(errors(sighting, SYMMETRIC.points[:, :2], truth) ** 2)) < 0.02
 
 
 def test_a_picture_without_a_board_is_refused_with_a_reason():
