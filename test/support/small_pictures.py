@@ -4,19 +4,21 @@ import cv2
 import numpy as np
 
 WIDTH, HEIGHT, FOCAL_PX = 320, 240, 400.0
+PRINCIPAL_POINT_PX = np.array([WIDTH / 2, HEIGHT / 2])
 #: Fine pixels in one, and in a cell of the drawn marker.
 _FINE, _CELL = 6, 16
 _BLACK, _WHITE = 60.0, 190.0
 _COLUMNS, _ROWS = 4, 3
 
 
-def _tilted(rng, side, tilt_deg):
-    """Corners (4, 2) [px] of a square about the optical axis, turned at random, tilted about a random axis."""
+def _tilted(rng, place, side, tilt_deg):
+    """Corners (4, 2) [px] of a square whose middle is seen at a place, turned at random, tilted about a random axis."""
     azimuth, roll = rng.uniform(0.0, 2.0 * np.pi, 2)
     axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     R = cv2.Rodrigues(axis * np.radians(tilt_deg))[0] @ cv2.Rodrigues(np.array([0.0, 0.0, roll]))[0]
-    corners = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]]) @ R.T
-    return FOCAL_PX * corners[:, :2] / (corners[:, 2:] + FOCAL_PX / side)
+    middle = np.array([*(place - PRINCIPAL_POINT_PX), FOCAL_PX]) / side
+    corners = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]]) @ R.T + middle
+    return FOCAL_PX * corners[:, :2] / corners[:, 2:] + PRINCIPAL_POINT_PX
 
 
 def _seen(fine, blur_px):
@@ -79,7 +81,7 @@ def counts_with_markers(rng, bits, side, tilt_deg, *, optics_px, contrast=330.0,
 def _with_markers(rng, bits, side, tilt_deg, fall=0.0):
     fine, places = _scene(rng)
     ids = rng.choice(len(bits), len(places), replace=False).tolist()
-    corners = {key: _tilted(rng, side, tilt_deg) + place for key, place in zip(ids, places, strict=True)}
+    corners = {key: _tilted(rng, place, side, tilt_deg) for key, place in zip(ids, places, strict=True)}
     for key, quad in corners.items():
         _drawn(fine, np.pad(bits[key].astype(float), 1), quad, fall)
     return fine, corners
@@ -89,7 +91,7 @@ def with_other_squares(rng, cells, side):
     """Picture of twelve squares with a black border around random gray ``cells`` x ``cells``."""
     fine, places = _scene(rng)
     for place in places:
-        _drawn(fine, np.pad(rng.random((cells, cells)).round(), 1), _tilted(rng, side, rng.uniform(0.0, 50.0)) + place)
+        _drawn(fine, np.pad(rng.random((cells, cells)).round(), 1), _tilted(rng, place, side, rng.uniform(0.0, 50.0)))
     return _developed(rng, fine, 0.5, 1.5)
 
 

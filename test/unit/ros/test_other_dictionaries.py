@@ -15,8 +15,8 @@ from thermal_fiducial.ros.base.node import WARN
 from thermal_fiducial.ros.camera_nodes.other_dictionaries import OtherDictionaries
 from thermal_fiducial.ros.messages import convert
 
-WIDTH, HEIGHT = small_pictures.WIDTH, small_pictures.HEIGHT
-CAMERA = Camera(WIDTH, HEIGHT, [[500.0, 0, WIDTH / 2], [0, 500.0, HEIGHT / 2], [0, 0, 1]], 'plumb_bob', [0.0] * 5)
+WIDTH, HEIGHT, FOCAL_PX = small_pictures.WIDTH, small_pictures.HEIGHT, small_pictures.FOCAL_PX
+CAMERA = Camera(WIDTH, HEIGHT, [[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HEIGHT / 2], [0, 0, 1]])
 #: One at each other dictionary, and two more.
 LOOKS = 12
 

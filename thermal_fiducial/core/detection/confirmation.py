@@ -14,6 +14,7 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corner_errors import (
+    BLURRED_OUT,
     OF_BENT_BLUR_PX,
     OF_BENT_SCALE_PX,
     OF_BORDER_PX,
@@ -30,13 +31,19 @@ from thermal_fiducial.core.detection.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.refining import RefinedMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
+from thermal_fiducial.core.geometry.planar_pose import planar_poses
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
 
 # Cells at least this wide are decoded at half resolution, with half the noise and less blur [px].
 _WIDE_CELL_PX = 8.0
-# Least correlation at the refined corners, and in a picture for a display. Everyday textures resemble patterns of few
-# bits: of 19 false positives of four such dictionaries in 100 pictures the best had 0.90.
-_SIMILAR, _SIMILAR_IN_PICTURE = 0.82, 0.92
+# Least correlation at the refined corners, and where nothing that they show may lower it, or a display may be anything.
+# Everyday textures resemble patterns of few bits: of 19 false positives of four such dictionaries in 100 pictures the
+# best had 0.90. Blur of less than 0.3 cells and noise of 0.05 contrasts leave more than 0.98, warmth that differs by a
+# third from one side of a marker to the other leaves 0.99.
+_SIMILAR, _SIMILAR_IF_CLEAR = 0.82, 0.92
+# Standard deviation of corners below which the contrast beside them is even [px]: by ``OF_UNEVEN_CONTRAST_PX`` it
+# changes by 6 % from cell to cell, a third over a marker. Corners of half-warm markers claim 0.05 and more.
+_EVEN_PX = 0.04
 # Least margin over the runner-up, as a share of the marker's isolation. It suffices for dictionaries that correct at
 # least _MANY_BITS wrong bits; noise and clutter often resemble one of the patterns of a 4 x 4 dictionary a little.
 _CLEAR_MARGIN = 0.5
@@ -48,6 +55,9 @@ _WHITE = (0.4, 1.75)
 _NEAR_CELLS = 0.7
 # Distance from the image's border below which a marker, by its refined corners, counts as possibly cut off [px].
 _BORDER_PX = 1.0
+# Distance from the nearest view of a square beyond which an outline is no marker's, rms [cells]. Bent sheets in photos
+# by a lens whose distortion is unknown are off by up to 0.05.
+_OFF_SQUARE_CELLS = 0.1
 # Displacement or standard deviation of blur that cells are read in spite of [cells].
 _LITTLE = 0.1
 # Half the window of ``cornerSubPix``: in cells, and at most in pixels.
@@ -150,7 +160,7 @@ def published(
 def _confirmed(
     frame: Frame, found: FoundMarkers, markers: RefinedMarkers, decoder: Decoder, config: ArucoDetectorConfig
 ) -> BoolArray:
-    """Which markers show their pattern at the refined corners."""
+    """Which markers show their pattern at the refined corners, and are squares."""
     corners = markers.observed.corners_px
     there = found.places.at.px + markers.blur.shift
     off_cells = np.abs(corners - there).max(axis=(1, 2)) * decoder.cells / se3.sides_px(there)
@@ -159,7 +169,22 @@ def _confirmed(
     if len(others):
         near = found.expected[others] & (off_cells[others] < _NEAR_CELLS)
         keep[others] = _readable(frame, markers.only(others), near, decoder, config)
-    return np.asarray(keep & frame.camera.contains(corners, _BORDER_PX).all(axis=1))
+    keep &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
+    doubtful = np.flatnonzero(keep & (markers.observed.doubt > 0.0))
+    if len(doubtful):
+        keep[doubtful] = _square(ImagePoints.at(corners[doubtful], frame.camera), decoder.cells)
+    return np.asarray(keep)
+
+
+def _square(at: ImagePoints, cells: int) -> BoolArray:
+    """Which outlines (N, 4) are about those of squares in space.
+
+    The constraints of :mod:`corners.squares` do not tell: small tilts hardly show in a small square, so that what they
+    miss by 0.1, a distance of 6 px in a side of 60, is 0.3 px in its corners.
+    """
+    count = len(at.px)
+    poses = planar_poses(at, np.tile(np.eye(2), (count, 4, 1, 1)), np.ones(count))
+    return np.asarray(poses.rms_px[:, 0] <= _OFF_SQUARE_CELLS / cells * se3.sides_px(at.px))
 
 
 def _readable(
@@ -173,9 +198,16 @@ def _readable(
     reading = _read(frame.image, corners, tails, decoder)
     known = near & reading.clear(config.guided_min_correlation, config.guided_min_margin)
     still = np.sqrt(np.sum(blur.spread**2, axis=1)) < _LITTLE / decoder.cells * se3.sides_px(corners)
-    similar = np.abs(reading.correlation) >= np.where(frame.displayed & still, _SIMILAR_IN_PICTURE, _SIMILAR)
+    clear = still & (frame.displayed | _sharp_and_even(markers.observed))
+    similar = np.abs(reading.correlation) >= np.where(clear, _SIMILAR_IF_CLEAR, _SIMILAR)
     distinct = (similar | (decoder.correctable >= _MANY_BITS)) & _stands_out(reading, decoder)
     return np.asarray((reading.ids == markers.ids) & (known | distinct))
+
+
+def _sharp_and_even(seen: RefinedCorners) -> BoolArray:
+    """Which markers (N,) show neither blur or noise nor a gradient of warmth that a pattern might differ by."""
+    variance = seen.covariances.diagonal(axis1=-2, axis2=-1).mean(axis=(1, 2))
+    return np.asarray((seen.noise < BLURRED_OUT * np.abs(seen.contrast)) & (variance < _EVEN_PX**2))
 
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:

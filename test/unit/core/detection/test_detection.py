@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from support.scenes import camera_of
@@ -9,6 +10,7 @@ from support.scenes import camera_of
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.confirmation import DisplayedSides
 from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, MARKER_DTYPE
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -92,3 +94,30 @@ def test_raw_counts_are_claimed_better_than_a_display(frames):
     bent = last_rows(frames, lambda counts: displayed(counts, 2.0))
     # Measured: 0.016 and 0.13 px.
     assert np.median(raw['sigma_px']) < 0.05 < 0.1 < np.median(bent['sigma_px'])
+
+
+@pytest.mark.parametrize(('height', 'found'), [(120, [3]), (150, []), (90, []), (60, [])])
+def test_a_pattern_that_is_no_square_in_space_is_no_marker(detector, height, found):
+    # Held obliquely, a square of 120 px in the image would be narrower on its far side.
+    camera = camera_of(named('wall'))
+    cells = np.pad(load_dictionary('DICT_4X4_50').bits[3], 2)
+    cells[:1] = cells[-1:] = cells[:, :1] = cells[:, -1:] = 1
+    drawn = cv2.resize(cells.astype(np.float32), (160, height * 4 // 3), interpolation=cv2.INTER_NEAREST)
+    image = np.zeros((camera.height, camera.width), np.float32)
+    image[40 : 40 + drawn.shape[0], 60 : 60 + drawn.shape[1]] = drawn
+    noise = np.random.default_rng(0).normal(0.0, 1.5, image.shape)
+    counts = np.rint(7000.0 + 200.0 * cv2.GaussianBlur(image, (0, 0), 0.66) + noise).astype(np.uint16)
+    assert detector.detect(0, counts, camera)['id'].tolist() == found
+
+
+@pytest.mark.parametrize('window', [(30, 15, 46, 39), (18, 7, 41, 25), (26, 21, 54, 45), (33, 21, 45, 45)])
+def test_a_dark_panel_with_a_light_window_is_no_marker(detector, window):
+    """A sharp and clear image does not explain that cells differ from the pattern: correlations of 0.82 to 0.92."""
+    left, top, right, bottom = window
+    light = np.ones((128, 160), np.float32)
+    light[34:94, 50:110] = 0.0
+    light[34 + top : 34 + bottom, 50 + left : 50 + right] = 1.0
+    noise = np.random.default_rng(0).normal(0.0, 1.5, light.shape)
+    counts = np.rint(7650.0 + 150.0 * cv2.GaussianBlur(light, (0, 0), 0.7) + noise).astype(np.uint16)
+    camera = Camera(160, 128, [[112.0, 0, 79.5], [0, 112.0, 63.5], [0, 0, 1]])
+    assert detector.detect(0, counts, camera)['id'].tolist() == []
