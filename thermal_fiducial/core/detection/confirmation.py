@@ -179,8 +179,8 @@ def _confirmed(
 def _square(at: ImagePoints, cells: int) -> BoolArray:
     """Which outlines (N, 4) are about those of squares in space.
 
-    The constraints of :mod:`corners.squares` do not tell: small tilts hardly show in a small square, so that what they
-    miss by 0.1, a distance of 6 px in a side of 60, is 0.3 px in its corners.
+    The constraints of :mod:`corners.squares` measure no distance in the image: a tilt hardly changes a small square, so
+    that corners 0.3 px off miss them by 0.1, or 6 px in a side of 60.
     """
     count = len(at.px)
     poses = planar_poses(at, np.tile(np.eye(2), (count, 4, 1, 1)), np.ones(count))
