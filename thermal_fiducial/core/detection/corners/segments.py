@@ -231,9 +231,8 @@ def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
 def adjust(sides: Sides, segments: Segments) -> tuple[FloatArray, FloatArray]:
     """Displacements (N, 8, 1) of the corners that fit all segments, and their covariances (N, 8, 8)."""
     used, cells = segments.variance < UNMEASURED, sides.normal.shape[1]
-    # A segment lies where its columns do, between the corners that its side begins and ends at.
-    t = (sides.t * sides.fresh).sum(axis=0) / np.maximum(sides.fresh.sum(axis=0), 1)
-    share = _AT_START + t.reshape(-1, 4, cells, 1) * _ONWARD
+    # A segment is a part of its side, between the corners that the side begins and ends at.
+    share = _AT_START + ((np.arange(cells) + 0.5) / cells)[:, None] * _ONWARD
     A = (share[..., None] * sides.normal.reshape(-1, 4, cells, 1, 2)).reshape(-1, 4 * cells, 8)
     sharpness = 1.0 / np.sqrt(segments.variance)
     fit = robust_fit(A * sharpness[..., None], segments.shift * sharpness, used, _PRIOR)
