@@ -67,7 +67,7 @@ MECHANISMS = {
     'change of the error of the map': Mechanism(
         ('map in the making',),
         ('pose_noise:BodyPose.map_change',),
-        {'pose_noise:BodyPose.map_change': lambda *_: np.zeros((6, 6))},
+        {'pose_noise:BodyPose.map_change': lambda *_: 0.0},
     ),
     'smaller error of the map': Mechanism(
         ('map in the making',),

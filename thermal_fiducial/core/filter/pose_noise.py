@@ -64,32 +64,26 @@ class BodyPose:
         moved = float(np.linalg.norm(T[:3, 3] - T_last[:3, 3])) / distance
         return math.exp(-(turned + moved) / angle + log_overlap(last.shape, self.shape))
 
-    def map_change(self, last: 'BodyPose') -> FloatArray:
-        """Covariance (6, 6), conventions of ``covariance``, of the change of the map's error since the ``last`` pose.
+    def map_change(self, last: 'BodyPose') -> float:
+        """Share, 0 to 1, of the map's error that is another one than in the ``last`` pose.
 
         The same markers in the same map have the same error. The overlap of the two covariances is the correlation.
         """
-        if not self.map_covariance.any():
-            return np.zeros((6, 6))
-        return (1.0 - self._same_map(last)) * self.of_map
+        if not (self.map_covariance.any() or last.map_covariance.any()):
+            return 0.0
+        then, now = self._in_robot_frame(last.map_covariance), self.of_map
+        return 1.0 - math.exp(2.0 * log_overlap(then + self.shape, now + self.shape))
 
     def map_error_left(self, last: 'BodyPose') -> FloatArray:
         """Covariance (6, 6), conventions of ``covariance``, by which the map's error of the ``last`` pose was larger.
 
-        An estimate by the last pose is off by that in the map of this one.
+        An estimate by the last pose is off by that in the map of this one, as far as the error is another one.
         """
-        if not last.map_covariance.any():
-            return np.zeros((6, 6))
         then = self._in_robot_frame(last.map_covariance)
         to_units = np.linalg.inv(np.linalg.cholesky(self.of_map + self.shape))
         variances, axes = np.linalg.eigh(to_units @ (then - self.of_map) @ to_units.T)
         roots = np.linalg.solve(to_units, axes * np.sqrt(np.maximum(variances, 0.0)))
-        return np.asarray((1.0 - self._same_map(last)) * roots @ roots.T)
-
-    def _same_map(self, last: 'BodyPose') -> float:
-        """Correlation, 0 to 1, of the map's errors of this pose and of the ``last`` one."""
-        then, now = self._in_robot_frame(last.map_covariance), self.of_map
-        return math.exp(2.0 * log_overlap(then + self.shape, now + self.shape))
+        return np.asarray(roots @ roots.T)
 
     @property
     def of_map(self) -> FloatArray:

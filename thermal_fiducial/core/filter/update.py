@@ -154,13 +154,17 @@ def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estim
     of_view = config.systematic_pose_std**2 * pose.shape
     # Changes of the map's error are in the systematic error too.
     most = of_view + pose.of_map
-    moved = by_map(estimate.state)
-    P = estimate.covariance + moved @ pose.map_error_left(last) @ moved.T
+    P = estimate.covariance.copy()
+    other_map = pose.map_change(last)
+    if other_map > 0.0:
+        moved = by_map(estimate.state)
+        P += other_map * moved @ pose.map_error_left(last) @ moved.T
     stays = share_that_stays(P[SYSTEMATIC, SYSTEMATIC], most)
     kept = alike * stays
     P[SYSTEMATIC] = kept @ P[SYSTEMATIC]
     P[:, SYSTEMATIC] = P[:, SYSTEMATIC] @ kept.T
-    P[SYSTEMATIC, SYSTEMATIC] += (1.0 - alike**2) * of_view + alike**2 * (most - stays @ most) + pose.map_change(last)
+    P[SYSTEMATIC, SYSTEMATIC] += (1.0 - alike**2) * of_view + alike**2 * (most - stays @ most)
+    P[SYSTEMATIC, SYSTEMATIC] += other_map * pose.of_map
     state = replace(estimate.state, systematic=kept @ estimate.state.systematic)
     return replace(estimate, state=state, covariance=P)
 

@@ -256,14 +256,14 @@ def test_the_map_has_the_same_error_while_its_covariance_is_the_same():
     R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
     of_map = np.diag(np.repeat((2e-2, 1e-2), 3) ** 2)
     here = BodyPose(transform(turned, np.zeros(3)), R, of_map)
-    assert not np.any(replace(here, map_covariance=np.zeros((6, 6))).map_change(here))
     # The robot turns, the map's error doesn't.
     again = replace(here, T_map_body=transform(turned @ so3_exp([0.0, 0.8, 0.0]), np.zeros(3)))
     # rounding
-    np.testing.assert_allclose(again.map_change(here), 0.0, atol=1e-12)
+    assert again.map_change(here) == pytest.approx(0.0, abs=1e-12)
     other_markers = replace(here, map_covariance=1e4 * of_map)
     # Nothing is left of the former error: rotation before position, in the robot frame, as isotropic as in the map.
-    np.testing.assert_allclose(other_markers.map_change(here), np.diag(np.repeat((1.0, 4.0), 3)), rtol=1e-4, atol=1e-6)
+    assert other_markers.map_change(here) == pytest.approx(1.0, abs=1e-4)
+    np.testing.assert_allclose(other_markers.of_map, np.diag(np.repeat((1.0, 4.0), 3)), rtol=1e-9, atol=1e-9)
 
 
 def test_an_error_of_the_map_that_was_larger_is_left_in_the_estimate():
@@ -271,7 +271,7 @@ def test_an_error_of_the_map_that_was_larger_is_left_in_the_estimate():
     small, large = np.diag(np.repeat((2e-3, 1e-3), 3) ** 2), np.diag(np.repeat((4e-2, 3e-2), 3) ** 2)
     near = BodyPose(transform(turned, np.zeros(3)), 1e-10 * np.eye(6), small)
     far = replace(near, map_covariance=large)
-    # Rotation before position, in the robot frame; of the former error a thousandth is common to both.
+    # Rotation before position, in the robot frame.
     left = np.diag(np.repeat((9e-4 - 1e-6, 1.6e-3 - 4e-6), 3))
     np.testing.assert_allclose(near.map_error_left(far), left, rtol=1e-3, atol=1e-9)
     np.testing.assert_allclose(far.map_error_left(near), 0.0, atol=1e-12)
@@ -335,7 +335,7 @@ def test_the_systematic_error_is_never_larger_than_a_pose_claims(estimate, still
     seen = replace(estimate, covariance=covariance, pose_noise=PoseNoise.of(vague))
     kept = innovation_of(FULL, seen, now, still).prior.covariance[SYSTEMATIC, SYSTEMATIC]
     # The map's change since the last pose is new, and small: both are in the same view.
-    most = now.shape + now.of_map + now.map_change(vague)
+    most = now.shape + now.of_map + now.map_change(vague) * now.of_map
     assert np.linalg.eigvalsh(most - kept).min() > -1e-12
 
 
