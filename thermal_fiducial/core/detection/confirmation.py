@@ -58,6 +58,8 @@ _BORDER_PX = 1.0
 # Distance from the nearest view of a square beyond which an outline is no marker's, rms [cells]. Bent sheets in photos
 # by a lens whose distortion is unknown are off by up to 0.05.
 _OFF_SQUARE_CELLS = 0.1
+# Standard deviations of its corners that are allowed for besides.
+_SIGMAS = 3.0
 # Displacement or standard deviation of blur that cells are read in spite of [cells].
 _LITTLE = 0.1
 # Half the window of ``cornerSubPix``: in cells, and at most in pixels.
@@ -172,19 +174,21 @@ def _confirmed(
     keep &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
     doubtful = np.flatnonzero(keep & (markers.observed.doubt > 0.0))
     if len(doubtful):
-        keep[doubtful] = _square(ImagePoints.at(corners[doubtful], frame.camera), decoder.cells)
+        variance = _variance(markers.observed)[doubtful]
+        keep[doubtful] = _square(ImagePoints.at(corners[doubtful], frame.camera), variance, decoder.cells)
     return np.asarray(keep)
 
 
-def _square(at: ImagePoints, cells: int) -> BoolArray:
-    """Which outlines (N, 4) are about those of squares in space.
+def _square(at: ImagePoints, variance: FloatArray, cells: int) -> BoolArray:
+    """Which outlines (N, 4), with corners of a ``variance`` (N,) [px^2], are about those of squares in space.
 
     The constraints of :mod:`corners.squares` measure no distance in the image: a tilt hardly changes a small square, so
     that corners 0.3 px off miss them by 0.1, or 6 px in a side of 60.
     """
     count = len(at.px)
     poses = planar_poses(at, np.tile(np.eye(2), (count, 4, 1, 1)), np.ones(count))
-    return np.asarray(poses.rms_px[:, 0] <= _OFF_SQUARE_CELLS / cells * se3.sides_px(at.px))
+    off_square = _OFF_SQUARE_CELLS / cells * se3.sides_px(at.px)
+    return np.asarray(poses.rms_px[:, 0] ** 2 <= off_square**2 + _SIGMAS**2 * variance)
 
 
 def _readable(
@@ -206,8 +210,13 @@ def _readable(
 
 def _sharp_and_even(seen: RefinedCorners) -> BoolArray:
     """Which markers (N,) show neither blur or noise nor a gradient of warmth that a pattern might differ by."""
-    variance = seen.covariances.diagonal(axis1=-2, axis2=-1).mean(axis=(1, 2))
+    variance = _variance(seen)
     return np.asarray((seen.noise < BLURRED_OUT * np.abs(seen.contrast)) & (variance < _EVEN_PX**2))
+
+
+def _variance(seen: RefinedCorners) -> FloatArray:
+    """Mean variance (N,) of the corners' coordinates [px^2]."""
+    return np.asarray(seen.covariances.diagonal(axis1=-2, axis2=-1).mean(axis=(1, 2)))
 
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:
