@@ -124,7 +124,7 @@ class MarkerFinder:
         else:
             others = wanted & ~among(last.ids, known.ids)
             expected = in_map.joined(last.only(others)) if others.any() else in_map
-            wanted = among(last.ids, expected.ids)
+            wanted &= among(last.ids, expected.ids)
         if not wanted.all():
             last, places = last.only(wanted), places.only(wanted)
         found = followed(frame, twist, last, places, self._decoder, config)

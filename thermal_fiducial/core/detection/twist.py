@@ -6,6 +6,7 @@ servo control I", 2006, eq. 11). The acceleration is that of a line through the 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+import math
 
 import numpy as np
 
@@ -76,14 +77,15 @@ def twist_by_odometry(
     t = np.array([(state.stamp_ns - stamp_ns) / SECOND_NS for state in odometry])
     middle = float(t.sum()) / len(t)
     off = t - middle
-    typical = transfer @ (sum(state.twist_covariance for state in odometry) / len(t)) @ transfer.T
+    typical = np.asarray(sum(state.twist_covariance for state in odometry) / len(t))
     noise = _LEAST.copy()
-    noise[3:, 3:] += typical[3:, 3:]
+    noise[3:, 3:] += transfer[3:, 3:] @ typical[3:, 3:] @ transfer[3:, 3:].T
     # Of few or noisy states the acceleration is hardly known: its prior is RANDOM.
     known = float(off @ off) + noise.diagonal() / RANDOM.diagonal()
     acceleration, unsure = off @ values / known, noise / known + float(t[-1] - t[0]) * _CHANGES
-    covariance = typical + (middle + lag) ** 2 * unsure + clock_std_s**2 * RANDOM + _LEAST
-    covariance[3:, 3:] -= typical[3:, 3:] * (1.0 - 1.0 / len(t))
+    # In all coordinates, as the rate's noise is in the velocity of a camera with a lever arm, too.
+    averaged = transfer @ np.diag([1.0] * 3 + [1.0 / math.sqrt(len(t))] * 3)
+    covariance = averaged @ typical @ averaged.T + (middle + lag) ** 2 * unsure + clock_std_s**2 * RANDOM + _LEAST
     return Twist(values.sum(axis=0) / len(t) - middle * acceleration, covariance, acceleration, unsure)
 
 
