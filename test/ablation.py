@@ -187,7 +187,7 @@ MECHANISMS = {
     'edges behind the sides': Mechanism(
         'fast, 8 K, blind',
         ('corners.sides:_of_cells',),
-        {'corners.sides:NARROW': 0.0},
+        {'corners.sides:_NARROW': 0.0},
     ),
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),

@@ -17,7 +17,6 @@ import numpy as np
 
 from thermal_fiducial.core.detection.blurred_patterns import linearised, pattern_grid, PatternResiduals, PatternView
 from thermal_fiducial.core.detection.corner_errors import OF_DISPLAYED_PATTERN_PX, OF_PATTERN_PX
-from thermal_fiducial.core.detection.corners.sides import NARROW
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
@@ -29,8 +28,11 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 
 # Bound on the number of false markers in a picture, were all of it squares with a black border around random bits.
 _FALSE_MARKERS = 0.01
-# Largest distance of samples [px], and least number of them along a cell.
-_APART_PX, _FEWEST = 0.85, 3
+# Width of cells, in blurs of the optics, below which whole patterns are fitted: at 7 a frame of 45 markers would take
+# twice the time.
+_NARROW = 6.0
+# Largest distance of samples [px], and least number of them along a cell: 0.85 px gives no better corners.
+_APART_PX, _FEWEST = 1.0, 3
 # Steps of a fit, and length of the step of a corner after which there is no further one [px]. Size and focus converge
 # slowly together: where the camera is out of focus a limit of 0.05 px leaves 1 to 3 per mille of the size, 0.02 px half
 # of that.
@@ -99,7 +101,7 @@ class PatternFit(NamedTuple):
 
 def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> BoolArray:
     """Which markers (N, 4, 2) have sides that are not measured by themselves, for a blur of the optics [px]."""
-    return np.asarray(sides_px(corners_px) < NARROW * blur_px * cells)
+    return np.asarray(sides_px(corners_px) < _NARROW * blur_px * cells)
 
 
 def fitted_patterns(

@@ -27,9 +27,9 @@ _REACHES, _SHORTEST, _LONGEST = 2.5, 4, 10
 _BOTH_SIDES, _BEYOND_NODES = 3, 3.0
 #: Parallel edges in the model, by their distance from the side [cells].
 NEIGHBOURS = (1, 2)
-#: Width of cells, in blurs, below which pixels near parallel edges are needed, and the model contains these edges. In
-#: blurs of the optics whole patterns are fitted below it; to sides of wider cells motion blur makes the difference.
-NARROW = 5.0
+# Width of cells, in blurs, below which pixels near parallel edges are needed, and the model contains these edges. It is
+# motion that blurs so much: where the optics do, whole patterns are fitted.
+_NARROW = 5.0
 # Approximation of the normal distribution by a hyperbolic tangent, good to 2e-4 (E. Page, "Approximations to the
 # cumulative normal function and its inverse for use on a pocket calculator", 1977).
 _LINEAR = 0.7988
@@ -243,7 +243,7 @@ def model(sides: Sides, behind: Float32Array, blur: Blur) -> tuple[Float32Array,
     """
     cells = behind.shape[2]
     cell = sides.across / cells
-    overlapping = cell < NARROW * blur.width
+    overlapping = cell < _NARROW * blur.width
     edges, which = behind.reshape(-1, cells, len(NEIGHBOURS)), np.flatnonzero(overlapping.any(axis=1))
     modelled = _blurred_sides(sides, edges, which, blur)
     value, slope, own = (each[0] if len(each) == 1 else each.mean(axis=0) for each in modelled)
