@@ -161,8 +161,12 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 
 def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cells: int | None = None) -> None:
-    """Print the narrowest web of each marker, and warnings about its strength."""
+    """Print the narrowest web of each marker, and warnings about its strength and its warm ring."""
     options = plate_options(args)
+    if options.quiet_cells < 1.0:
+        # doc/accuracy.md: the detector takes the warm surface for one that ends a cell outside the marker.
+        ring = f'a warm ring of {options.quiet_cells:g} cells is too narrow'
+        print(f'warning: {ring}: markers are measured too small, by 1 % at 0.7; 1 or more', file=sys.stderr)
     cells = cells or chosen(args)[0].shape[1] + 2
     with progress_bar('measuring webs') as progress:
         for done, drawing in enumerate(drawings, 1):

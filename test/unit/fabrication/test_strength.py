@@ -91,6 +91,14 @@ def test_the_plate_of_the_defaults_is_fine(tmp_path, capsys):
     assert 'marker 5: narrowest web 3.0 mm (hole wall)' in output.out
 
 
+def test_a_warm_ring_that_is_too_narrow_is_named(tmp_path, capsys):
+    command = ['markers', 'make', '--ids', '5', '--formats', 'svg', '--force', '--out', str(tmp_path), '--quiet-cells']
+    assert main([*command, '0.7']) == 0
+    assert 'warning: a warm ring of 0.7 cells is too narrow' in capsys.readouterr().err
+    assert main([*command, '1']) == 0
+    assert capsys.readouterr().err == ''
+
+
 def test_a_neck_of_the_width_in_the_warning_is_strong_enough():
     heavy = PlateOptions(size=600.0)
     complaint = strength_of(marker_drawing(BITS[5], '5', heavy), heavy, 6, 3.0).complaints[0]
