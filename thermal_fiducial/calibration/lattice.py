@@ -241,7 +241,7 @@ def _seeds(keypoints: Keypoints, scale: int) -> IntArray:
     # Pairs of opposite neighbours, the nearest first; the second pair is the next that runs in another direction.
     row, one, other = np.nonzero(np.triu(opposite))
     unit = offset[row, one] / length[row, one][:, None]
-    begins = np.searchsorted(row, row)
+    begins = np.asarray(np.searchsorted(row, row))
     across = np.abs(unit[begins, 0] * unit[:, 1] - unit[begins, 1] * unit[:, 0]) > _LEAST_SINE
     second = np.flatnonzero(across)
     second = second[np.unique(row[second], return_index=True)[1]]

@@ -265,8 +265,8 @@ def _content(at: PatternResiduals, cells: int) -> FloatArray:
     """Share (Q,) of the variance that a border around a plain square, each of any gray, leaves: that of the bits."""
     inner = np.pad(np.ones((cells - 2, cells - 2)), 1)
     squares = np.stack([np.ones((cells, cells)), inner])
-    shown = at.y.value[:, None] @ squares @ at.x.value.swapaxes(1, 2)[:, None]
-    shown = at.grid.without_background(shown.reshape(len(at.seen), 2, -1))
+    drawn = at.y.value[:, None] @ squares @ at.x.value.swapaxes(1, 2)[:, None]
+    shown = at.grid.without_background(drawn.reshape(len(at.seen), 2, -1).astype(np.float32))
     product = shown @ at.seen[..., None]
     explained = product.swapaxes(1, 2) @ np.linalg.solve(shown @ shown.swapaxes(1, 2) + TINY * np.eye(2), product)
     return np.asarray(1.0 - explained[:, 0, 0] / np.maximum((at.seen * at.seen).sum(axis=1), TINY))

@@ -273,7 +273,7 @@ def _blurred_sides(
     ends = (sides.along / blur.along).astype(np.float32)[:, None]
     # Blurred along the side, the share (P, C, E, m) is less than 1 near the ends.
     z = np.array([t, 1.0 - t]) * ends
-    own = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0)
+    own = np.asarray(0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0), dtype=np.float32)
     value, slope = blurred_step(distance, sharpness[:, None], -own[:, None])
     if len(overlapping):
         distance, sharpness = distance[..., overlapping, :], sharpness[:, None, :, overlapping]
