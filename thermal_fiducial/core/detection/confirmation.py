@@ -174,7 +174,7 @@ def _confirmed(
     keep &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
     doubtful = np.flatnonzero(keep & (markers.observed.doubt > 0.0))
     if len(doubtful):
-        variance = _variance(markers.observed)[doubtful]
+        variance = markers.observed.mean_variance[doubtful]
         keep[doubtful] = _square(ImagePoints.at(corners[doubtful], frame.camera), variance, decoder.cells)
     return np.asarray(keep)
 
@@ -210,13 +210,7 @@ def _readable(
 
 def _sharp_and_even(seen: RefinedCorners) -> BoolArray:
     """Which markers (N,) show neither blur or noise nor a gradient of warmth that a pattern might differ by."""
-    variance = _variance(seen)
-    return np.asarray((seen.noise < BLURRED_OUT * np.abs(seen.contrast)) & (variance < _EVEN_PX**2))
-
-
-def _variance(seen: RefinedCorners) -> FloatArray:
-    """Mean variance (N,) of the corners' coordinates [px^2]."""
-    return np.asarray(seen.covariances.diagonal(axis1=-2, axis2=-1).mean(axis=(1, 2)))
+    return np.asarray((seen.noise < BLURRED_OUT * np.abs(seen.contrast)) & (seen.mean_variance < _EVEN_PX**2))
 
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:

@@ -124,14 +124,12 @@ def fitted_patterns(
     fit = fit_patterns(view, start.px, found.ids, decoder, blur_px)
     # The two constraints of a square in space hold for them, too.
     square = as_squares(start.at_pixels(fit.corners_px), np.zeros((len(found.ids), 8, 1)), fit.covariance)
-    together = (8 / (8 - square.constrained))[:, None, None, None]
-    blocks = square.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
     floor = OF_DISPLAYED_PATTERN_PX if frame.displayed else OF_PATTERN_PX
     corners = fit.corners_px + square.moved.reshape(-1, 4, 2)
     doubt = square.doubt * squared_sides(corners).mean(axis=1)
     doubt = np.where(fit.step_px > _CONVERGED_PX, np.maximum(doubt, fit.step_px**2), doubt)
     off = np.abs(corners - start.px).max(axis=(1, 2)) * decoder.cells / sides_px(start.px)
-    covariances, fitted = together * blocks + floor**2 * _EYE, np.ones(len(doubt), dtype=bool)
+    covariances, fitted = square.corner_covariances + floor**2 * _EYE, np.ones(len(doubt), dtype=bool)
     evident, refuted = found.certain & (off < _NEAR), ~fitted
     others = np.flatnonzero(~evident)
     if len(others):

@@ -33,6 +33,11 @@ class RefinedCorners(Stacked):
     evident: BoolArray
     refuted: BoolArray
 
+    @property
+    def mean_variance(self) -> FloatArray:
+        """Mean variance (N,) of the corners' coordinates [px^2]."""
+        return np.asarray(self.covariances.diagonal(axis1=-2, axis2=-1).mean(axis=(1, 2)))
+
     @staticmethod
     def none() -> 'RefinedCorners':
         """No corners."""

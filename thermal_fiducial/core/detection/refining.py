@@ -131,8 +131,7 @@ def _at_stamp(
 ) -> RefinedMarkers:
     """Corners at the stamp, without lag and rolling shutter, by the twist that they correct."""
     at = places.at.at_pixels(seen.corners_px - blur.shift)
-    variances = seen.covariances.diagonal(axis1=-2, axis2=-1)
-    deviation = np.sqrt(variances.mean(axis=(1, 2))) / frame.camera.focal_px
+    deviation = np.sqrt(seen.mean_variance) / frame.camera.focal_px
     # Corners that are inconsistent with a square get a larger covariance.
     doubted = seen.covariances + seen.doubt[:, None, None, None] * _EYE
     # Without a predicted twist, the first round measures one between two lagging frames, and the second must not again:

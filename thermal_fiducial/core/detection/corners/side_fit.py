@@ -104,10 +104,7 @@ def _near(sides: Sides, blur: Blur, uneven: BoolArray) -> BoolArray:
 
 def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCorners, IntArray]:
     """Corners after one linearised adjustment, and places (M,) of the markers that have not converged."""
-    # Corners that constrain one another have correlated errors: as independent ones they would claim too much.
-    together = (8 / (8 - known.constrained))[:, None, None, None]
-    blocks = known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
-    covariances = together * blocks + OF_ALL_SIDES_PX**2 * _EYE
+    covariances = known.corner_covariances + OF_ALL_SIDES_PX**2 * _EYE
     # In an outline that is inconsistent with a square, some side belongs to another object.
     doubt = known.doubt * (sides.along.reshape(-1, 4).sum(axis=1) / 4) ** 2
     good = segments.variance < UNMEASURED

@@ -43,6 +43,16 @@ class Squared(NamedTuple):
     #: (N,) number of the two degrees of freedom that the constraints determine rather than the image
     constrained: FloatArray
 
+    @property
+    def corner_covariances(self) -> FloatArray:
+        """Covariances (N, 4, 2, 2) of the single corners.
+
+        Corners that constrain one another have correlated errors: as independent ones they would claim too much.
+        """
+        together = (8 / (8 - self.constrained))[:, None, None, None]
+        blocks = self.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
+        return np.asarray(together * blocks)
+
 
 def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squared:
     """Displacements of corners with the constraint of a square.
