@@ -119,11 +119,40 @@ class Grower:
 
     def __init__(self, keypoints: Keypoints) -> None:
         self.pixels, self._hessians = keypoints.pixels, keypoints.hessians
+        self._alternate = keypoints.alternate
         self._scale, self._strength = keypoints.scale, np.log(keypoints.response)
         self._similar = {scale: _similar_scales(keypoints, scale) for scale in np.unique(keypoints.scale).tolist()}
         self._trees = {scale: cKDTree(self.pixels[similar]) for scale, similar in self._similar.items()}
         self.seeds: list[Seed] = sorted(
-            tuple(seed) for scale in self._similar for seed in _seeds(keypoints, scale).tolist()
+            tuple(seed) for scale in self._similar for seed in self._seeds_of(scale).tolist()
+        )
+
+    def _seeds_of(self, scale: int) -> IntArray:
+        """Seeds (S, 5) of a search scale, as :data:`Seed`: nearest like neighbours of similar scales on four sides."""
+        similar, own = self._similar[scale], np.flatnonzero(self._scale == scale)
+        if len(similar) < 5:
+            return np.zeros((0, 5), np.int64)
+        pixels, hessians, strength = self.pixels, self._hessians, self._strength
+        _, near = self._trees[scale].query(pixels[own], min(_NEIGHBOURS + 1, len(similar)))
+        near = similar[near[:, 1:]]
+        offset = pixels[near] - pixels[own][:, None]
+        length = np.linalg.norm(offset, axis=-1)
+        sign = -1.0 if self._alternate else 1.0
+        like = sign * np.einsum('nki,ni->nk', hessians[near], hessians[own]) > _LIKE
+        like &= np.abs(strength[near] - strength[own][:, None]) < np.log(_STRONGER)
+        closing = np.linalg.norm(offset[:, :, None] + offset[:, None], axis=-1)
+        opposite = closing < _SEED_TOLERANCE * np.minimum(length[:, :, None], length[:, None])
+        opposite &= like[:, :, None] & like[:, None]
+        # Pairs of opposite neighbours, the nearest first; the second pair is the next that runs in another direction.
+        row, one, other = np.nonzero(np.triu(opposite))
+        unit = offset[row, one] / length[row, one][:, None]
+        begins = np.asarray(np.searchsorted(row, row))
+        across = np.abs(unit[begins, 0] * unit[:, 1] - unit[begins, 1] * unit[:, 0]) > _LEAST_SINE
+        second = np.flatnonzero(across)
+        second = second[np.unique(row[second], return_index=True)[1]]
+        first = begins[second]
+        return np.column_stack(
+            [own[row[second]], *(near[row[pair], end[pair]] for pair in (first, second) for end in (one, other))]
         )
 
     def total_contrast(self) -> float:
@@ -219,36 +248,6 @@ class Grower:
 def _similar_scales(keypoints: Keypoints, scale: int) -> IntArray:
     """Keypoints of a search scale, the next finer and the next coarser one: perspective spreads a board over them."""
     return np.flatnonzero(np.abs(keypoints.scale - scale) <= 1)
-
-
-def _seeds(keypoints: Keypoints, scale: int) -> IntArray:
-    """Seeds (S, 5) of a search scale, see :data:`Seed`: the nearest like neighbours of similar scales on four sides."""
-    similar = _similar_scales(keypoints, scale)
-    own = np.flatnonzero(keypoints.scale == scale)
-    if len(similar) < 5:
-        return np.zeros((0, 5), np.int64)
-    pixels, hessians, strength = keypoints.pixels, keypoints.hessians, np.log(keypoints.response)
-    _, near = cKDTree(pixels[similar]).query(pixels[own], min(_NEIGHBOURS + 1, len(similar)))
-    near = similar[near[:, 1:]]
-    offset = pixels[near] - pixels[own][:, None]
-    length = np.linalg.norm(offset, axis=-1)
-    sign = -1.0 if keypoints.alternate else 1.0
-    like = sign * np.einsum('nki,ni->nk', hessians[near], hessians[own]) > _LIKE
-    like &= np.abs(strength[near] - strength[own][:, None]) < np.log(_STRONGER)
-    closing = np.linalg.norm(offset[:, :, None] + offset[:, None], axis=-1)
-    opposite = closing < _SEED_TOLERANCE * np.minimum(length[:, :, None], length[:, None])
-    opposite &= like[:, :, None] & like[:, None]
-    # Pairs of opposite neighbours, the nearest first; the second pair is the next that runs in another direction.
-    row, one, other = np.nonzero(np.triu(opposite))
-    unit = offset[row, one] / length[row, one][:, None]
-    begins = np.asarray(np.searchsorted(row, row))
-    across = np.abs(unit[begins, 0] * unit[:, 1] - unit[begins, 1] * unit[:, 0]) > _LEAST_SINE
-    second = np.flatnonzero(across)
-    second = second[np.unique(row[second], return_index=True)[1]]
-    first = begins[second]
-    return np.column_stack(
-        [own[row[second]], *(near[row[pair], end[pair]] for pair in (first, second) for end in (one, other))]
-    )
 
 
 def _around(node: Node, reach: int) -> list[Node]:

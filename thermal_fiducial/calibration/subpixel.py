@@ -75,7 +75,7 @@ def refine(
             return Refined(np.full_like(pixels, np.nan), appearance.width)
         width = float(np.median(alone.width[found]))
         before, appearance = appearance.width, appearance.of_width(width)
-        if abs(appearance.width - before) < _SAME_WIDTH * before:
+        if abs(appearance.width - before) <= _SAME_WIDTH * before:
             break
     log_blur = _plane(nodes[found], alone.log_blur[found], nodes)
     shared = _Shared(log_blur, np.full(len(nodes), width))

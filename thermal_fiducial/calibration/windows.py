@@ -1,5 +1,6 @@
 """Pixel windows around the points of a board, with the background removed."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,10 +116,9 @@ def windows_around(
     whole = np.pi * reach**2 * np.abs(np.linalg.det(surfaces.steps))
     count = inside.sum(axis=1)
     enough = np.flatnonzero(count >= np.maximum(_LEAST_PIXELS, appearance.least_visible * whole))
-    weight, offsets, places, pixels = (
-        _packed(inside[enough], values[enough])
-        for values in (np.sqrt(np.maximum(1.0 - away, 0.0)), offsets, places, pixels)
-    )
+    weights = np.sqrt(np.maximum(1.0 - away, 0.0))
+    every = (values[enough] for values in (weights, offsets, places, pixels))
+    weight, offsets, places, pixels = _packed(inside[enough], *every)
     v, u = pixels[..., ::-1].astype(np.int64).transpose(2, 0, 1)
     counts = image[v, u].astype(np.float64) * weight
     ground = np.linalg.qr(np.concatenate([np.ones_like(offsets[..., :1]), offsets], axis=2) * weight[..., None])[0]
@@ -138,18 +138,20 @@ def windows_around(
     )
 
 
-def _packed(inside: BoolArray, values: FloatArray) -> FloatArray:
+def _packed(inside: BoolArray, *every: FloatArray) -> Iterator[FloatArray]:
     """Values (P, N, ...) of the pixels ``inside`` (P, M) of each window, in their order, and zeros behind them.
 
     Parameters
     ----------
-    values : (P, M, ...)
+    every : (P, M, ...) values of one kind each
     """
     point, pixel = np.nonzero(inside)
     column = (np.cumsum(inside, axis=1) - 1)[point, pixel]
-    packed = np.zeros((len(inside), inside.sum(axis=1).max(initial=0), *values.shape[2:]))
-    packed[point, column] = values[point, pixel]
-    return packed
+    room = len(inside), inside.sum(axis=1).max(initial=0)
+    for values in every:
+        packed = np.zeros((*room, *values.shape[2:]))
+        packed[point, column] = values[point, pixel]
+        yield packed
 
 
 def _box(image: Float32Array, starts: FloatArray, extent: FloatArray) -> tuple[FloatArray, BoolArray]:
