@@ -79,9 +79,9 @@ class BodyPose:
 
         An estimate by the last pose is off by that in the map of this one, as far as the error is another one.
         """
-        then = self._in_robot_frame(last.map_covariance)
-        to_units = np.linalg.inv(np.linalg.cholesky(self.of_map + self.shape))
-        variances, axes = np.linalg.eigh(to_units @ (then - self.of_map) @ to_units.T)
+        then, now = self._in_robot_frame(last.map_covariance), self.of_map
+        to_units = np.linalg.inv(np.linalg.cholesky(now + self.shape))
+        variances, axes = np.linalg.eigh(to_units @ (then - now) @ to_units.T)
         roots = np.linalg.solve(to_units, axes * np.sqrt(np.maximum(variances, 0.0)))
         return np.asarray(roots @ roots.T)
 
