@@ -21,7 +21,7 @@ from thermal_fiducial.core.geometry.se3 import (
     so3_log,
     transform,
 )
-from thermal_fiducial.core.mapping.bundle_adjustment import refine
+from thermal_fiducial.core.mapping.keyframes import VIEWS
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.second_camera import SecondCamera
@@ -202,19 +202,13 @@ class _Chain:
         if (offset := self.filter.camera_time_offset) is not None:
             self._prior.set_clock_offset(offset)
         if self.mapper.refinement_due(stamp_ns):
-            self._refine()
+            self.mapper.refine(VIEWS)
         return pose
 
     def finish(self) -> None:
         """Refine the map with the last keyframes, as the node does before it saves."""
         if self.mapper.has_unrefined:
-            self._refine()
-
-    def _refine(self):
-        snapshot = self.mapper.snapshot()
-        refinement = None if snapshot is None else refine(snapshot)
-        if refinement is not None:
-            self.mapper.apply(refinement)
+            self.mapper.refine(VIEWS)
 
 
 def fly(flight, marker_map=None, *, mode='localization', late=0.03, left_out=(), second=None, **config) -> Run:

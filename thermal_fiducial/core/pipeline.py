@@ -30,7 +30,7 @@ from thermal_fiducial.core.geometry.se3 import (
     transform_from_quaternion,
 )
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
-from thermal_fiducial.core.mapping.bundle_adjustment import refine
+from thermal_fiducial.core.mapping.keyframes import VIEWS
 from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import ImuSample, Markers, Odometry
@@ -141,20 +141,15 @@ class Pipeline:
             update = self.filter.add_pose(replace(pose, T_map_camera=as_published(pose.T_map_camera)))
         if (offset := self.filter.camera_time_offset) is not None:
             self._odometry.set_clock_offset(offset)
-        refined = self.mapper.refinement_due(stamp_ns) and self._refine()
+        refined = self.mapper.refinement_due(stamp_ns) and self.mapper.refine(VIEWS) is not None
         if refined or mapping.map_changed:
             self._share_map()
         return FrameResult(stamp_ns, markers=markers, mapping=mapping, update=update)
 
     def finish(self) -> None:
         """Refine the map with the last keyframes, as the mapper does before it saves at the end."""
-        if self.mapper.has_unrefined and self._refine():
+        if self.mapper.has_unrefined and self.mapper.refine(VIEWS) is not None:
             self._share_map()
-
-    def _refine(self) -> bool:
-        snapshot = self.mapper.snapshot()
-        refinement = None if snapshot is None else refine(snapshot)
-        return refinement is not None and self.mapper.apply(refinement)
 
     def _share_map(self) -> None:
         """Give the detector the map, as the ``marker_map`` topic does."""

@@ -215,9 +215,14 @@ class MarkerMapper:
         """
         return self._keyframes.snapshot(self.map, self._errors, views)
 
-    def refine(self) -> AdjustedMap | None:
-        """Run a bundle adjustment of all keyframes and apply it: for tools, where time does not matter."""
-        snapshot = self.snapshot(views=sys.maxsize)
+    def refine(self, views: int = sys.maxsize) -> AdjustedMap | None:
+        """Run a bundle adjustment here and apply it: of all keyframes, or as in flight.
+
+        Parameters
+        ----------
+        views : of :meth:`snapshot`
+        """
+        snapshot = self.snapshot(views)
         refinement = refine(snapshot) if snapshot is not None else None
         if refinement is not None:
             self.apply(refinement)

@@ -75,9 +75,9 @@ class MapRefinement:
             return False
         until = time.monotonic() + seconds
         # First one that is under way, or the start of its process.
-        changed = self._apply(self._worker.wait(seconds))
+        changed = self._apply(self._worker.take(seconds))
         if not self._worker.busy and self._mapper.has_unrefined and self._begin(self._worker):
-            changed |= self._apply(self._worker.wait(until - time.monotonic()))
+            changed |= self._apply(self._worker.take(until - time.monotonic()))
         return changed
 
     def _begin(self, worker: Worker) -> bool:

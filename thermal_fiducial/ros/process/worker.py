@@ -31,14 +31,10 @@ class Foreground(Generic[Task, Result]):
         """Process ``task``."""
         self._result = self._function(task)
 
-    def take(self) -> Result | None:
+    def take(self, patience_s: float = 0.0) -> Result | None:
         """The result, once; None as long as there is none."""
         result, self._result = self._result, None
         return result
-
-    def wait(self, seconds: float) -> Result | None:
-        """The result, as :meth:`take`: it is there at once."""
-        return self.take()
 
     def close(self) -> None:
         """Nothing to stop."""
@@ -112,8 +108,8 @@ class Background(Generic[Task, Result]):
 
         self._begin(work)
 
-    def take(self) -> Result | None:
-        """The result, once; None as long as there is none.
+    def take(self, patience_s: float = 0.0) -> Result | None:
+        """The result, once; None as long as there is none, for which it waits up to ``patience_s`` [s].
 
         Raises
         ------
@@ -122,21 +118,15 @@ class Background(Generic[Task, Result]):
         """
         if self._thread is None:
             return None
+        self._thread.join(patience_s)
         if self._thread.is_alive():
             if time.monotonic() > self._until:
                 self._process.kill()
             return None
-        self._thread.join()
         self._thread, outcome, self._outcome = None, self._outcome, None
         if isinstance(outcome, Exception):
             raise InputError(f'{self._function.__name__} failed: {outcome}')
         return outcome
-
-    def wait(self, seconds: float) -> Result | None:
-        """The result, as :meth:`take`, but wait up to ``seconds`` for it."""
-        if self._thread is not None:
-            self._thread.join(seconds)
-        return self.take()
 
     def close(self) -> None:
         """Terminate the process, even during a task."""
