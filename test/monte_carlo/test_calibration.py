@@ -7,7 +7,8 @@ import pytest
 from support.boards import chessboard_levels, plate_pose, random_view, render
 
 from thermal_fiducial.calibration.intrinsics import calibrate
-from thermal_fiducial.calibration.targets import BoardNotFound, Chessboard
+from thermal_fiducial.calibration.recognition import BoardNotFound
+from thermal_fiducial.calibration.targets import Chessboard
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.sim.scenario import LENSES
 

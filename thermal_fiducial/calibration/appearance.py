@@ -227,26 +227,31 @@ class Disc:
 def _disc(places: FloatArray, blur: FloatArray, width: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
     """Disc (...) at places (..., 2) relative to its centre, and its derivatives as in :class:`Appearance`.
 
+    An edge of radius of curvature r, blurred by s along it, moves inwards by s^2 / 2 r: a disc of 1.6 blurs keeps 0.72
+    of its contrast, with straight edges it would keep 0.94. ``hypot(distance, s)`` for the distance from the centre
+    has that shift, and differs from the true profile (Marcum's Q) by 0.02 there.
+
     Parameters
     ----------
     blur : (..., 2)
     width : (...) radius
     """
     x, y = places[..., 0], places[..., 1]
-    x_blur, y_blur = x / blur[..., 0] ** 2, y / blur[..., 1] ** 2
-    radius = np.sqrt(x * x + y * y) + 1e-9
-    # Distances from centre and edge in units of the blur along that direction.
-    steps = np.sqrt(x * x_blur + y * y_blur) + 1e-9
-    outwards = width / radius - 1.0
-    inside = outwards * steps
+    xx, yy, x_blur, y_blur = x * x, y * y, blur[..., 0] ** 2, blur[..., 1] ** 2
+    square = xx + yy + 1e-18
+    # Variances of the blur across the edge and along it.
+    across, along = (xx * x_blur + yy * y_blur) / square + 1e-18, (yy * x_blur + xx * y_blur) / square
+    distance = np.sqrt(square + along)
+    by_radius = 1.0 / np.sqrt(across)
+    inside = (width - distance) * by_radius
     density = _density(inside)
-    by_blur, by_radius = outwards / steps * density, width * steps / radius**3 * density
     slopes = np.empty((free, *x.shape))
     if free > 0:
-        slopes[0] = x_blur * by_blur - x * by_radius
-        slopes[1] = y_blur * by_blur - y * by_radius
+        outwards, turning = density * by_radius / distance, density * inside / (across * square)
+        slopes[0] = -x * (outwards * (1.0 + (y_blur - along) / square) + turning * (x_blur - across))
+        slopes[1] = -y * (outwards * (1.0 + (x_blur - along) / square) + turning * (y_blur - across))
     if free > 2:
-        slopes[2] = -inside * density
+        slopes[2] = -density * (inside + along / distance * by_radius)
     if free > 3:
-        slopes[3] = steps / radius * density
+        slopes[3] = density * by_radius
     return np.asarray(ndtr(inside)), slopes

@@ -23,8 +23,10 @@ _APART = 1.5
 _WIDE = 4.0
 _LEAST_SIDE = 8
 _MOST_POINTS = 800
-# Least ratio of response to noise; and noise of second derivatives by the rounding of counts at blur s, times s^3.
-_NOISE_RATIO, _ROUNDING = 4.5, 0.02
+#: Least ratio of a second derivative to its noise.
+NOISE_RATIO = 4.5
+# Noise of second derivatives by the rounding of counts at blur s, times s^3.
+_ROUNDING = 0.02
 # Largest distance of a saddle from the stationary point, in blurs. At the outer corner of a board's last square, or
 # where three surfaces meet, it is 1.2 or more.
 _STATIONARY = 0.8
@@ -43,6 +45,7 @@ class Keypoints:
     hessians : (N, 3) unit vectors of Iuu, Ivv, sqrt(2) Iuv: which way a saddle lies
     response : (N,) determinant of the Hessian, free of scale
     scale : (N,) index of the search scale, from coarse to fine
+    signal : (N,) second derivative relative to its noise, at least :data:`NOISE_RATIO`
     alternate : whether neighbours on a board have opposite Hessians (chessboard corners) or similar ones (discs)
     """
 
@@ -50,12 +53,19 @@ class Keypoints:
     hessians: FloatArray
     response: FloatArray
     scale: IntArray
+    signal: FloatArray
     alternate: bool
 
     def rows(self, index: IntArray | BoolArray) -> 'Keypoints':
         """Some of them."""
-        parts = self.pixels[index], self.hessians[index], self.response[index], self.scale[index]
-        return Keypoints(*parts, self.alternate)
+        return Keypoints(
+            self.pixels[index],
+            self.hessians[index],
+            self.response[index],
+            self.scale[index],
+            self.signal[index],
+            self.alternate,
+        )
 
 
 def without_speckles(counts: Counts | Gray) -> Float32Array:
@@ -83,8 +93,9 @@ def blobs(image: Float32Array) -> list[Keypoints]:
 
 def _strongest(found: list[Keypoints]) -> Keypoints:
     """Points of all scales; of those of similar scales closer than the coarser one the strongest."""
-    pixels, hessians, response, scale = (
-        np.concatenate([getattr(part, name) for part in found]) for name in ('pixels', 'hessians', 'response', 'scale')
+    pixels, hessians, response, scale, signal = (
+        np.concatenate([getattr(part, name) for part in found])
+        for name in ('pixels', 'hessians', 'response', 'scale', 'signal')
     )
     kept = np.ones(len(pixels), dtype=np.bool_)
     trees = [cKDTree(part.pixels) if len(part.pixels) else None for part in found]
@@ -97,7 +108,7 @@ def _strongest(found: list[Keypoints]) -> Keypoints:
             pairs = tree.sparse_distance_matrix(other, _APART * _SCALES[coarse], output_type='ndarray')
             one, two = pairs['i'] + first[coarse], pairs['j'] + first[fine]
             kept[np.where(response[one] < response[two], one, two)[response[one] != response[two]]] = False
-    every = Keypoints(pixels, hessians, response, scale, found[0].alternate)
+    every = Keypoints(pixels, hessians, response, scale, signal, found[0].alternate)
     return every.rows(np.flatnonzero(kept)[np.argsort(-response[kept], kind='stable')])
 
 
@@ -107,7 +118,7 @@ def _extrema(image: Float32Array, scale: int, *, saddle: bool) -> Keypoints:
     shrink = max(1, int(blur / 1.5))
     size = image.shape[1] // shrink, image.shape[0] // shrink
     if min(size) < _LEAST_SIDE:
-        return Keypoints(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64), saddle)
+        return Keypoints(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64), np.zeros(0), saddle)
     if shrink > 1:
         image = cv2.resize(image[: size[1] * shrink, : size[0] * shrink], size, interpolation=cv2.INTER_AREA).astype(
             np.float32
@@ -120,7 +131,7 @@ def _extrema(image: Float32Array, scale: int, *, saddle: bool) -> Keypoints:
     response = -determinant if saddle else determinant
     # Of a normal distribution a quarter lies within 0.3186 standard deviations.
     noise = max(float(np.percentile(np.abs(uv), 25.0)) / 0.3186, _ROUNDING / sigma**3)
-    peak = (response >= cv2.dilate(response, np.ones((3, 3), np.uint8))) & (response > (_NOISE_RATIO * noise) ** 2)
+    peak = (response >= cv2.dilate(response, np.ones((3, 3), np.uint8))) & (response > (NOISE_RATIO * noise) ** 2)
     peak[[0, -1]] = peak[:, [0, -1]] = False
     v, u = np.nonzero(peak)
     hessians = np.stack([uu[v, u], vv[v, u], np.sqrt(2.0) * uv[v, u]], axis=1).astype(np.float64)
@@ -129,7 +140,9 @@ def _extrema(image: Float32Array, scale: int, *, saddle: bool) -> Keypoints:
     hessians /= np.linalg.norm(hessians, axis=1, keepdims=True) + 1e-12
     pixels = (np.stack([u, v], axis=1) + step + 0.5) * shrink - 0.5
     strength = response[v, u].astype(np.float64) * sigma**4
-    found = Keypoints(pixels, hessians, strength, np.full(len(pixels), scale), saddle).rows(np.flatnonzero(still))
+    signal = np.sqrt(response[v, u].astype(np.float64)) / noise
+    every = Keypoints(pixels, hessians, strength, np.full(len(pixels), scale), signal, saddle)
+    found = every.rows(np.flatnonzero(still))
     return found.rows(np.argsort(-found.response, kind='stable')[:_MOST_POINTS])
 
 

@@ -1,19 +1,17 @@
-"""Regular grids among keypoints, grown point by point, and the board within a grid.
+"""Regular grids among keypoints, grown point by point.
 
 Each point is predicted from its nearest grid points only, so lens distortion, perspective, and contrast that fades or
 reverses over a board do not matter.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from thermal_fiducial.calibration.keypoints import Keypoints
-from thermal_fiducial.calibration.placement import BoardNodes, GridRefusal
 from thermal_fiducial.calibration.surface import local_surfaces, REACH
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -36,74 +34,6 @@ _TOLERANCE, _SEED_TOLERANCE, _ORDERLY, _ENOUGH = 0.3, 0.25, 0.15, 6
 _LEAST_SINE = 0.35
 
 
-@dataclass(frozen=True)
-class BoardPoints:
-    """Points of a board in an image.
-
-    Parameters
-    ----------
-    points : (N,) their index on the board
-    pixels : (N, 2) where they are, to a pixel or a tenth of their spacing
-    beyond_nodes, beyond_pixels : (B, 2) grid points outside the board
-    """
-
-    points: IntArray
-    pixels: FloatArray
-    beyond_nodes: IntArray
-    beyond_pixels: FloatArray
-
-
-@dataclass(frozen=True)
-class LargerGrid:
-    """A grid that covers a board and extends beyond it: another board, or this one with clutter beside it.
-
-    Parameters
-    ----------
-    nodes, pixels : (L, 2)
-    covered : number of board points in it
-    """
-
-    nodes: IntArray
-    pixels: FloatArray
-    covered: int
-
-
-def find_board(views: Iterable[Keypoints], board: BoardNodes) -> tuple[BoardPoints | GridRefusal, LargerGrid | None]:
-    """Most complete sighting of a board among several sets of keypoints, or why there is none.
-
-    Also the larger grid that covers most of the board, if it covers more than the sighting.
-    """
-    best: BoardPoints | None = None
-    refusal, weightiest = GridRefusal('no regular grid of points'), 0.0
-    larger: LargerGrid | None = None
-    growers = sorted(map(Grower, views), key=Grower.total_contrast, reverse=True)
-    for grower, grid in ((source, grid) for source in growers for grid in source.grids()):
-        pixels = grower.pixels[list(grid.values())]
-        nodes = _facing(np.array(list(grid), dtype=np.int64), pixels)
-        placed = board.place(nodes)
-        if isinstance(placed, GridRefusal):
-            # Among many points that belong to no board a large grid may be chance: its share of them counts too.
-            weight = len(grid) ** 2 / len(grower.pixels)
-            if weight > weightiest:
-                refusal, weightiest = placed, weight
-            if placed.covered > (0 if larger is None else larger.covered):
-                larger = LargerGrid(nodes, pixels, placed.covered)
-        elif best is None or len(placed.points) > len(best.points):
-            best = BoardPoints(placed.points, pixels[placed.rows], placed.beyond_nodes, pixels[placed.beyond])
-            if len(best.points) == len(board.nodes):
-                break
-    if best is not None and larger is not None and larger.covered <= len(best.points):
-        larger = None
-    return best or refusal, larger
-
-
-def _facing(nodes: IntArray, pixels: FloatArray) -> IntArray:
-    """Nodes of a grid with axes that turn like those of the image."""
-    design = np.column_stack([np.ones(len(nodes)), nodes])
-    steps = np.linalg.lstsq(design, pixels, rcond=None)[0][1:]
-    return nodes if np.linalg.det(steps) > 0.0 else np.ascontiguousarray(nodes[:, ::-1])
-
-
 class Grower:
     """Grows grids of keypoints.
 
@@ -114,11 +44,14 @@ class Grower:
     Attributes
     ----------
     pixels : (N, 2)
+    contrast, signal : (N,)
     seeds : strongest first
     """
 
     def __init__(self, keypoints: Keypoints) -> None:
         self.pixels, self._hessians = keypoints.pixels, keypoints.hessians
+        # Responses are contrasts squared.
+        self.contrast, self.signal = np.sqrt(keypoints.response), keypoints.signal
         self._alternate = keypoints.alternate
         self._scale, self._strength = keypoints.scale, np.log(keypoints.response)
         self._similar = {scale: _similar_scales(keypoints, scale) for scale in np.unique(keypoints.scale).tolist()}
@@ -156,8 +89,8 @@ class Grower:
         )
 
     def total_contrast(self) -> float:
-        """Of the seeds; responses are contrasts squared."""
-        return float(np.exp(0.5 * self._strength[[seed[0] for seed in self.seeds]]).sum())
+        """Of the seeds."""
+        return float(self.contrast[[seed[0] for seed in self.seeds]].sum())
 
     def grids(self) -> Iterator[dict[Node, int]]:
         """Keypoints (their index) by their place in a grid, strongest seeds first; those of a grid seed no other."""

@@ -22,11 +22,18 @@ _QUARTER = np.array([[0, -1], [1, 0]])
 class GridRefusal:
     """Why a grid is not the board.
 
-    If the grid has more points than the board, ``covered`` is the number of board points in it.
+    Parameters
+    ----------
+    reason : in words
+    covered : number of board points that may be in the grid; 0 where most of the board is not
+    larger : whether it may be the board nevertheless, if its points beyond the board are clutter
+    another : whether it is another board if those points are none
     """
 
     reason: str
     covered: int = 0
+    larger: bool = False
+    another: bool = False
 
 
 @dataclass(frozen=True)
@@ -80,10 +87,17 @@ class BoardNodes:
         unclear = most - second < _CLEAR * self._margin
         # A few extra points belong to another board if all of this one is seen, and are clutter if its border is not.
         if beyond > _BEYOND * count + 1.0 or (unclear and beyond > 0 and most >= (1.0 - _BEYOND) * count):
-            return GridRefusal(goes_on(beyond), int(most))
+            return GridRefusal(goes_on(beyond), int(most), larger=True, another=True)
+        placement = self._best(grid, overlaps)
         if unclear:
+            # Clutter makes a place unclear only if it is clear without.
             reason = f'{most:.0f} of {count} points found, which may lie in more than one place of the board'
-            return GridRefusal(reason, int(most) if beyond else 0)
+            clear = beyond > 0 and isinstance(self.place(grid[placement.rows]), GridPlacement)
+            return GridRefusal(reason, int(most), larger=clear)
+        return placement
+
+    def _best(self, grid: IntArray, overlaps: list[FloatArray]) -> GridPlacement:
+        """Placement with the largest overlap."""
         best = int(np.argmax([overlap.max() for overlap in overlaps]))
         view, overlap = self._views[best], overlaps[best]
         pattern = view.nodes(self._outline)

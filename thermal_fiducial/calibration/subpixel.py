@@ -10,40 +10,36 @@ Points are fitted in batches: their windows are small, and a numpy call takes lo
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from thermal_fiducial.calibration.appearance import Appearance
+from thermal_fiducial.calibration.point_fit import fit_points, PointFits, Shared
 from thermal_fiducial.calibration.surface import CLOSELY, local_surfaces, ROUGHLY
 from thermal_fiducial.calibration.windows import PointWindows, windows_around, with_expected_contrast
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# Initial blur in steps of the grid, and its lower limit in pixels.
-_BLUR, _LEAST_BLUR = 0.06, 0.8
-# Most steps of a fit, rejected ones included; length of the last step, in the last round and before, whose error is a
-# tenth of it; initial damping, and damping at which the fit gives up.
-_MOST_STEPS, _CONVERGED_PX, _NEARLY_PX, _DAMPING, _MOST_DAMPED = 40, 5e-3, 3e-2, 1e-3, 1e3
-# A point is lost when its standard deviation exceeds this [px], when the fit moves further than this from the start
-# [steps], or when its contrast relative to that predicted from the neighbours is outside these limits.
-_MOST_SIGMA_PX, _MOST_MOVE, _CONTRAST = 0.5, 0.25, (0.6, 1.6)
 _LEAST_POINTS = 6
-# Number of points, spread over the board, for blur and width; each determines them to a few per cent.
-_SAMPLE = 48
+# Number of points, spread over the board, for blur and width; each determines them to a few per cent. And for the blur
+# of a grid that is refused.
+_SAMPLE, _FEW = 48, 8
 # Most samples, since a width far from the described one takes another window, and relative change that takes none.
 _MOST_SAMPLES, _SAME_WIDTH = 4, 0.05
-# Number of linear parameters of a fit: background (level and slope) and contrast.
-_LINEAR = 4
 # Points and pixels per batch: enough for long rows, few enough for a processor's cache.
 _POINTS_AT_A_TIME, _PIXELS_AT_A_TIME = 160, 30000
 
 
 class Refined(NamedTuple):
-    """Points (N, 2) of a board, NaN where lost, and the width of its pattern, see :class:`Appearance` [steps]."""
+    """Points (N, 2) of a board, NaN where lost, and the width of its pattern [steps], see :class:`Appearance`.
+
+    ``width_sigma`` is the standard error of the width.
+    """
 
     pixels: FloatArray
     width: float
+    width_sigma: float
+    blur_px: float
 
 
 def refine(
@@ -67,26 +63,62 @@ def refine(
     appearance = appearance.at(nodes, board)
     every = np.arange(len(nodes))
     grid = np.ones(len(nodes), dtype=np.bool_) if grid is None else grid
-    some = np.sort(np.random.default_rng(0).permutation(np.flatnonzero(grid))[:_SAMPLE])
-    for _ in range(_MOST_SAMPLES):
-        alone = _round(image, nodes, pixels, appearance, some, grid, None, None)
-        found = np.isfinite(alone.contrast)
-        if np.sum(found) < _LEAST_POINTS:
-            return Refined(np.full_like(pixels, np.nan), appearance.width)
-        width = float(np.median(alone.width[found]))
-        before, appearance = appearance.width, appearance.of_width(width)
-        if abs(appearance.width - before) <= _SAME_WIDTH * before:
-            break
+    first = _sampled(image, nodes, pixels, appearance, grid)
+    found, lost = np.isfinite(first.fits.contrast), np.full_like(pixels, np.nan)
+    if np.sum(found) < _LEAST_POINTS:
+        return Refined(lost, appearance.width, np.inf, np.nan)
+    appearance, alone = first.appearance, first.fits
+    width, blur_px = float(np.median(alone.width[found])), float(np.exp(np.median(alone.log_blur[found])))
+    # Of a median, whose error is a quarter more than that of a mean.
+    spread = 1.4826 * float(np.median(np.abs(alone.width[found] - width)))
+    known = width, 1.25 * spread / np.sqrt(np.sum(found)), blur_px
     log_blur = _plane(nodes[found], alone.log_blur[found], nodes)
-    shared = _Shared(log_blur, np.full(len(nodes), width))
-    pixels = _next_starts(nodes, pixels, alone.pixels, some, grid)
+    shared = Shared(log_blur, np.full(len(nodes), width))
+    pixels = _next_starts(nodes, pixels, alone.pixels, first.some, grid)
     alike = _round(image, nodes, pixels, appearance, every, grid, shared, None)
     if np.sum(np.isfinite(alike.contrast)) < _LEAST_POINTS:
-        return Refined(np.full_like(pixels, np.nan), width)
+        return Refined(lost, *known)
     pixels = _next_starts(nodes, pixels, alike.pixels, every, grid)
     refined = _round(image, nodes, pixels, appearance, every, grid, shared, alike.contrast)
     enough = np.sum(np.isfinite(refined.contrast)) >= _LEAST_POINTS
-    return Refined(refined.pixels if enough else np.full_like(pixels, np.nan), width)
+    return Refined(refined.pixels if enough else lost, *known)
+
+
+def blur_of(image: Float32Array, nodes: FloatArray, pixels: FloatArray, appearance: Appearance) -> float:
+    """Blur of the points of a grid [px]; NaN where they do not look like the appearance."""
+    every = np.ones(len(nodes), dtype=np.bool_)
+    fits = _sampled(image, nodes, pixels, appearance.at(nodes, nodes), every, _FEW).fits
+    found = np.isfinite(fits.contrast)
+    return float(np.exp(np.median(fits.log_blur[found]))) if np.sum(found) >= _LEAST_POINTS else np.nan
+
+
+class _Sample(NamedTuple):
+    """Points ``some`` of a grid, fitted each alone, and the appearance of their median width."""
+
+    some: IntArray
+    fits: PointFits
+    appearance: Appearance
+
+
+def _sampled(
+    image: Float32Array,
+    nodes: FloatArray,
+    pixels: FloatArray,
+    appearance: Appearance,
+    grid: BoolArray,
+    count: int = _SAMPLE,
+) -> _Sample:
+    """Fit some points of a ``grid``, again with other windows while their width is another than that of the windows."""
+    some = np.sort(np.random.default_rng(0).permutation(np.flatnonzero(grid))[:count])
+    for _ in range(_MOST_SAMPLES):
+        fits = _round(image, nodes, pixels, appearance, some, grid, None, None)
+        found = np.isfinite(fits.contrast)
+        if np.sum(found) < _LEAST_POINTS:
+            break
+        before, appearance = appearance.width, appearance.of_width(float(np.median(fits.width[found])))
+        if abs(appearance.width - before) <= _SAME_WIDTH * before:
+            break
+    return _Sample(some, fits, appearance)
 
 
 def _next_starts(
@@ -101,22 +133,6 @@ def _next_starts(
     return starts
 
 
-class _Shared(NamedTuple):
-    """Common parameters of a board's points: blur at each point (N,) [log px], width (N,) [steps]."""
-
-    log_blur: FloatArray
-    width: FloatArray
-
-
-class _Fits(NamedTuple):
-    """Points (N, 2), logarithm of the blur (N,) [px], width (N,) [steps] and contrast (N,); NaN where lost."""
-
-    pixels: FloatArray
-    log_blur: FloatArray
-    width: FloatArray
-    contrast: FloatArray
-
-
 def _round(
     image: Float32Array,
     nodes: FloatArray,
@@ -124,13 +140,13 @@ def _round(
     appearance: Appearance,
     index: IntArray,
     grid: BoolArray,
-    shared: _Shared | None,
+    shared: Shared | None,
     contrast: FloatArray | None,
-) -> _Fits:
+) -> PointFits:
     """Fit points ``index`` once; with ``contrast``, points without one are lost and not used for the ``grid``."""
     known = grid if contrast is None else grid & np.isfinite(contrast)
     ridge = ROUGHLY if shared is None else CLOSELY
-    fits = _Fits(np.full_like(pixels, np.nan), *np.full((3, len(nodes)), np.nan))
+    fits = PointFits(np.full_like(pixels, np.nan), *np.full((3, len(nodes)), np.nan))
     for first in range(0, len(index), _POINTS_AT_A_TIME):
         part = index[first : first + _POINTS_AT_A_TIME]
         surfaces = local_surfaces(nodes[known], pixels[known], nodes[part], ridge)
@@ -140,8 +156,8 @@ def _round(
             windows = with_expected_contrast(windows, nodes[part], nodes[known], contrast[known])
         for some in _few_pixels(windows):
             points = part[some.index]
-            common = None if shared is None else _Shared(*(values[points] for values in shared))
-            fitted = _fit(some, common, with_contrast=contrast is not None)
+            common = None if shared is None else Shared(*(values[points] for values in shared))
+            fitted = fit_points(some, common, with_contrast=contrast is not None)
             for values, new in zip(fits, fitted, strict=True):
                 values[points] = new
     return fits
@@ -162,111 +178,3 @@ def _plane(nodes: FloatArray, values: FloatArray, places: FloatArray) -> FloatAr
     design = np.column_stack([np.ones(len(nodes)), nodes])
     coefficients = np.linalg.lstsq(design[kept], values[kept], rcond=None)[0]
     return np.asarray(np.column_stack([np.ones(len(places)), places]) @ coefficients)
-
-
-def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) -> _Fits:
-    """Levenberg-Marquardt fit of all parameters of each point, or of places alone with ``shared`` ones given."""
-    parameters = np.zeros((len(windows.index), 4))
-    if shared is None:
-        parameters[:, 2] = np.log(np.maximum(_LEAST_BLUR, _BLUR / windows.scale.max(axis=1)))
-        parameters[:, 3] = windows.appearance.width
-        free = 4
-    else:
-        parameters[:, 2], parameters[:, 3] = shared
-        free = 2
-        windows = windows.with_neighbours_held(parameters)
-    state = _CornerState.at(windows, parameters, free)
-    damping = np.full(len(parameters), _DAMPING)
-    moving = np.arange(len(parameters))
-    enough = _CONVERGED_PX if with_contrast else _NEARLY_PX
-    for _ in range(_MOST_STEPS):
-        step = state.rows(moving).step(damping[moving])
-        short = np.abs(step[:, :2]).max(axis=1) < enough
-        # Too short a step for the cost to be evaluated again.
-        state.parameters[moving[short]] += step[short]
-        moving, step = moving[~short], step[~short]
-        if len(moving) == 0:
-            break
-        tried = _CornerState.at(windows.rows(moving), state.parameters[moving] + step, free)
-        better = tried.cost <= state.cost[moving]
-        state.put(moving[better], tried.rows(np.flatnonzero(better)))
-        damping[moving] *= np.where(better, 0.1, 10.0)
-        moving = moving[(damping[moving] < _MOST_DAMPED) & (_moved(windows, state)[moving] < 2.0 * _MOST_MOVE)]
-        if len(moving) == 0:
-            break
-    lost = ~_well_determined(windows, state)
-    if with_contrast:
-        lost |= ~((_CONTRAST[0] < state.contrast) & (state.contrast < _CONTRAST[1]))
-    values = np.column_stack([windows.starts + state.parameters[:, :2], state.parameters[:, 2:], state.contrast])
-    values[lost] = np.nan
-    return _Fits(values[:, :2], *values[:, 2:].T)
-
-
-def _well_determined(windows: PointWindows, state: '_CornerState') -> BoolArray:
-    """Mask (P,) of the fits with a small standard deviation that end near their start."""
-    freedom = np.maximum(1.0, (windows.weight**2).sum(axis=1) - state.free - _LINEAR)
-    # A ridge in place of the zeros of a fit without contrast, which determines nothing.
-    ridge = 1e-12 * np.trace(state.normal, axis1=1, axis2=2) + 1e-30
-    covariance = np.linalg.inv(state.normal + ridge[:, None, None] * np.eye(state.free + 1))
-    variance = state.cost / freedom * (covariance[:, 0, 0] + covariance[:, 1, 1])
-    return np.asarray((variance < _MOST_SIGMA_PX**2) & (_moved(windows, state) < _MOST_MOVE))
-
-
-def _moved(windows: PointWindows, state: '_CornerState') -> FloatArray:
-    """Distances (P,) from the starts [steps]."""
-    return np.asarray(np.linalg.norm((windows.inverse @ state.parameters[:, :2, None])[..., 0], axis=1))
-
-
-@dataclass(frozen=True)
-class _CornerState:
-    """Parameters (P, 4) of fits, of which ``free`` are estimated, with the normal equations there.
-
-    Parameters
-    ----------
-    contrast : (P,) least-squares contrast
-    cost : (P,) sum of squared residuals of the counts
-    normal : (P, free + 1, free + 1) normal matrix of the free parameters and the contrast
-    gradient : (P, free + 1)
-    """
-
-    free: int
-    parameters: FloatArray
-    contrast: FloatArray
-    cost: FloatArray
-    normal: FloatArray
-    gradient: FloatArray
-
-    @classmethod
-    def at(cls, windows: PointWindows, parameters: FloatArray, free: int) -> '_CornerState':
-        """State at ``parameters``."""
-        among, with_counts = windows.products(parameters, free)
-        size = among[:, 0, 0] + 1e-12
-        contrast = with_counts[:, 0] / size
-        cost = (windows.counts**2).sum(axis=1) - with_counts[:, 0] ** 2 / size
-        # The derivatives of the pattern by the parameters, times the contrast, and the pattern itself.
-        order, scale = [*range(1, 1 + free), 0], np.ones((len(size), free + 1))
-        scale[:, :free] = contrast[:, None]
-        normal = among[:, order][:, :, order] * scale[:, :, None] * scale[:, None]
-        gradient = scale * (with_counts - contrast[:, None] * among[:, 0])[:, order]
-        return cls(free, parameters, contrast, cost, normal, gradient)
-
-    def step(self, damping: FloatArray) -> FloatArray:
-        """Damped step (P, 4) downhill."""
-        damped = self.normal.copy()
-        diagonal = np.arange(self.free + 1)
-        damped[:, diagonal, diagonal] += damping[:, None] * (damped[:, diagonal, diagonal] + 1e-9)
-        step = np.zeros_like(self.parameters)
-        step[:, : self.free] = np.linalg.solve(damped, self.gradient[..., None])[:, : self.free, 0]
-        return step
-
-    def rows(self, index: IntArray) -> '_CornerState':
-        """The state of a subset of the points."""
-        return _CornerState(self.free, *(values[index] for values in self._arrays()))
-
-    def put(self, index: IntArray, other: '_CornerState') -> None:
-        """Replace the state of points ``index`` by ``other``."""
-        for values, new in zip(self._arrays(), other._arrays(), strict=True):
-            values[index] = new
-
-    def _arrays(self) -> tuple[FloatArray, ...]:
-        return self.parameters, self.contrast, self.cost, self.normal, self.gradient

@@ -1,31 +1,25 @@
 """Calibration boards and their detection in raw frames: chessboard, circle grid, marker board."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from thermal_fiducial.calibration.appearance import Appearance, Disc, SquaresMeet
-from thermal_fiducial.calibration.keypoints import blobs, Keypoints, saddles, without_speckles
-from thermal_fiducial.calibration.lattice import find_board, LargerGrid
-from thermal_fiducial.calibration.placement import BoardNodes, goes_on, GridRefusal
-from thermal_fiducial.calibration.subpixel import refine
+from thermal_fiducial.calibration.appearance import Disc, SquaresMeet
+from thermal_fiducial.calibration.keypoints import blobs, saddles, without_speckles
+from thermal_fiducial.calibration.placement import BoardNodes
+from thermal_fiducial.calibration.recognition import BoardNotFound, recognise
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import corners_px, Markers
-from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 from thermal_fiducial.errors import InputError
 
 _APART_NS = 10_000_000_000
 # Number of similar discs beyond the board that prove a larger grid; one or two may be clutter.
 _ANOTHER_GRID = 3
-# Largest deviation of the circles' width from the described one. Blur of half a radius lowers what is measured by 8 %;
-# the radius enters where the middle of an image of a circle lies, with its square.
-_OF_ITS_WIDTH = 0.2
-# Smallest share of matching points of a grid that is reported as incomplete; below, it is another pattern.
-_ALIKE = 0.5
 
 
 @dataclass(frozen=True)
@@ -40,10 +34,6 @@ class Sighting:
 
     points: FloatArray
     pixels: FloatArray
-
-
-class BoardNotFound(InputError):  # noqa: N818  (nothing went wrong)
-    """The board is not found in a frame; the message says why."""
 
 
 class Target(Protocol):
@@ -92,7 +82,8 @@ class Chessboard:
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
         """See :class:`Target`."""
         image = without_speckles(counts)
-        return _sighting(image, saddles(image), self._board, self.points, SquaresMeet(), self._line)
+        found = recognise(image, saddles(image), self._board, SquaresMeet(), self._line)
+        return Sighting(self.points[found.points], found.pixels)
 
 
 class CircleGrid:
@@ -140,7 +131,9 @@ class CircleGrid:
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
         """See :class:`Target`."""
         image = without_speckles(counts)
-        return _sighting(image, blobs(image), self._board, self.points, self._disc, _ANOTHER_GRID)
+        tone_curve = counts.dtype == np.uint8
+        found = recognise(image, blobs(image), self._board, self._disc, _ANOTHER_GRID, tone_curve=tone_curve)
+        return Sighting(self.points[found.points], found.pixels)
 
 
 def _circles(places: IntArray, spacing: float, longer: int, *, asymmetric: bool) -> tuple[IntArray, FloatArray]:
@@ -163,67 +156,6 @@ def _rectangle(columns: int, rows: int) -> IntArray:
 
 def _on_board(points: FloatArray) -> FloatArray:
     return np.asarray(np.column_stack([points, np.zeros(len(points))]), dtype=np.float64)
-
-
-def _sighting(
-    image: Float32Array,
-    keypoints: Iterable[Keypoints],
-    board: BoardNodes,
-    points: FloatArray,
-    appearance: Appearance,
-    another: int,
-) -> Sighting:
-    """Find a board and refine its points to a few hundredths of a pixel.
-
-    With at least ``another`` similar points beyond it, it is another board.
-    """
-    found, larger = find_board(keypoints, board)
-    if isinstance(found, GridRefusal):
-        of_larger = np.zeros((0, 2)) if larger is None else _refined(image, larger, appearance)
-        good = np.isfinite(of_larger[:, 0])
-        if larger is None or np.sum(good) < _ALIKE * len(good):
-            raise BoardNotFound(found.reason)
-        return _within(larger.nodes[good], of_larger[good], board, points, another)
-    # Points beyond the board are refined too, which rejects clutter but not the points of another board.
-    count, beside = len(found.points), len(found.beyond_nodes)
-    beside = beside if beside >= another else 0
-    nodes = np.concatenate([board.nodes[found.points], found.beyond_nodes[:beside]]).astype(np.float64)
-    starts = np.concatenate([found.pixels, found.beyond_pixels[:beside]])
-    pixels, width = refine(
-        image, nodes, starts, board.nodes.astype(np.float64), appearance, grid=np.arange(len(nodes)) < count
-    )
-    good = np.isfinite(pixels[:, 0])
-    # The same for a larger grid of another scale that extends beyond the board.
-    alike = 0 if larger is None else int(np.sum(np.isfinite(_refined(image, larger, appearance)[:, 0])))
-    beyond = max(int(np.sum(good[count:])), alike - len(points))
-    if beyond >= another:
-        raise BoardNotFound(goes_on(beyond))
-    if abs(width - appearance.width) > _OF_ITS_WIDTH * appearance.width > 0.0:
-        raise BoardNotFound(f'the circles are {width / appearance.width:.2f} times as wide as described')
-    kept = found.points[good[:count]]
-    if len(kept) < _ALIKE * count:
-        raise BoardNotFound(f'{len(kept)} of {count} points look as described: out of focus, or of other sizes')
-    # Placed again, since rejected points may have been the only ones that determined the placement.
-    placed = board.place(board.nodes[kept])
-    if isinstance(placed, GridRefusal):
-        raise BoardNotFound(placed.reason)
-    return Sighting(points[kept], pixels[:count][good[:count]])
-
-
-def _refined(image: Float32Array, larger: LargerGrid, appearance: Appearance) -> FloatArray:
-    """Points (L, 2) of a larger grid, NaN where nothing looks like a point of the board."""
-    nodes = larger.nodes.astype(np.float64)
-    return refine(image, nodes, larger.pixels, nodes, appearance).pixels
-
-
-def _within(nodes: IntArray, pixels: FloatArray, board: BoardNodes, points: FloatArray, another: int) -> Sighting:
-    """The board among points (L, 2) that look like its own, after clutter beside it was rejected."""
-    placed = board.place(nodes)
-    if isinstance(placed, GridRefusal):
-        raise BoardNotFound(placed.reason)
-    if len(placed.beyond) >= another:
-        raise BoardNotFound(goes_on(len(placed.beyond)))
-    return Sighting(points[placed.points], pixels[placed.rows])
 
 
 class MarkerBoard:

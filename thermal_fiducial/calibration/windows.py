@@ -9,8 +9,8 @@ from thermal_fiducial.calibration.appearance import Appearance
 from thermal_fiducial.calibration.surface import Surfaces
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# Smallest spacing of points for a sub-pixel fit [px].
-_LEAST_SPACING = 4.0
+#: Smallest spacing of points for a sub-pixel fit [px].
+LEAST_SPACING = 4.0
 _LEAST_PIXELS = 12
 # Bounds of the blur [px].
 _BLUR_BOUNDS = (0.2, 60.0)
@@ -104,7 +104,7 @@ def windows_around(
     blur : (P,) [px], if known
     """
     spacing = np.linalg.norm(surfaces.steps, axis=1).min(axis=1)
-    index = np.flatnonzero(surfaces.determined & (spacing >= _LEAST_SPACING))
+    index = np.flatnonzero(surfaces.determined & (spacing >= LEAST_SPACING))
     starts, surfaces, appearance = starts[index], surfaces.rows(index), appearance.rows(index)
     reach = appearance.reach(spacing[index], None if blur is None else blur[index])
     inverse: FloatArray = np.asarray(np.linalg.inv(surfaces.steps), dtype=np.float64)

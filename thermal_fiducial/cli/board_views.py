@@ -10,9 +10,10 @@ import numpy as np
 from thermal_fiducial.calibration.intrinsics import Calibration, LEAST_VIEWS
 from thermal_fiducial.calibration.lens_choice import choose_model
 from thermal_fiducial.calibration.plots import coverage
+from thermal_fiducial.calibration.recognition import BoardNotFound
 from thermal_fiducial.calibration.report import BoardView
 from thermal_fiducial.calibration.sources import clean_frames, pictures, RawFrame, read_picture
-from thermal_fiducial.calibration.targets import BoardNotFound, Sighting, Target
+from thermal_fiducial.calibration.targets import Sighting, Target
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError

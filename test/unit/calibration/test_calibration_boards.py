@@ -8,7 +8,8 @@ from support.heated_boards import Heat, picture
 from thermal_fiducial.calibration.appearance import Disc
 from thermal_fiducial.calibration.lattice import Grower
 from thermal_fiducial.calibration.placement import BoardNodes, GridRefusal
-from thermal_fiducial.calibration.targets import BoardNotFound, Chessboard, CircleGrid
+from thermal_fiducial.calibration.recognition import BoardNotFound
+from thermal_fiducial.calibration.targets import Chessboard, CircleGrid
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 

@@ -10,7 +10,8 @@ from support.heated_boards import Heat, picture
 import yaml
 
 from thermal_fiducial.calibration.keypoints import without_speckles
-from thermal_fiducial.calibration.targets import BoardNotFound, Chessboard, CircleGrid
+from thermal_fiducial.calibration.recognition import BoardNotFound
+from thermal_fiducial.calibration.targets import Chessboard, CircleGrid
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -114,7 +115,7 @@ def test_command_calibrates_a_folder(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert 'cells covered' in printed
     assert '% of the image' in printed
-    assert '08.png: not used: no regular grid' in printed
+    assert '08.png: not used: no board found: out of view' in printed
     page = out.with_suffix('.html').read_text()
     # Every view with its points and residuals under its name, and the one that gave nothing with the reason.
     drawn, seen = page[: page.index('class="views"')], page[page.index('class="views"') :]
@@ -132,7 +133,7 @@ def test_command_calibrates_a_folder(tmp_path, capsys):
     bars = drawn[drawn.index('rms of each view') :]
     assert all(f'>{index:02}.png</text>' in bars for index in range(8))
     assert all(f'{index:02}.png:' in seen for index in range(8))
-    assert re.search(r'<td>08.png</td><td>no regular grid', page)
+    assert re.search(r'<td>08.png</td><td>no board found: out of view', page)
     # Words begin at the left, and a phone shows a table whole.
     assert page.index('<table class="words"><tr><th>frame</th><th>reason</th>') > page.index(
         '.words td,.words th{text-align:left}'
@@ -194,7 +195,7 @@ def test_too_few_views_are_counted_and_the_others_named(tmp_path, capsys):
     assert main(['calibrate', 'intrinsics', str(tmp_path), '--out', str(tmp_path / 'c.yaml')]) == 2
     error = capsys.readouterr().err
     assert '2 of 3 frames are usable views' in error
-    assert 'blank.png: no regular grid of points' in error
+    assert 'blank.png: no board found: out of view' in error
     assert not (tmp_path / 'c.yaml').exists()
 
 
