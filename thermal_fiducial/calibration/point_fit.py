@@ -16,6 +16,8 @@ _MOST_STEPS, _CONVERGED_PX, _NEARLY_PX, _DAMPING, _MOST_DAMPED = 40, 5e-3, 3e-2,
 # A point is lost when its standard deviation exceeds this [px], when the fit moves further than this from the start
 # [steps], or when its contrast relative to that predicted from the neighbours is outside these limits.
 _MOST_SIGMA_PX, _MOST_MOVE, _CONTRAST = 0.5, 0.25, (0.6, 1.6)
+# Fits with less weight for deviating pixels; deviation [standard deviations] where half is left; least share left.
+_REWEIGHTED, _DEVIATING, _LEAST_LEFT = 4, 3.0, 0.4
 # Number of linear parameters of a fit: background (level and slope) and contrast.
 _LINEAR = 4
 
@@ -28,16 +30,27 @@ class Shared(NamedTuple):
 
 
 class PointFits(NamedTuple):
-    """Points (N, 2), logarithm of the blur (N,) [px], width (N,) [steps] and contrast (N,); NaN where lost."""
+    """Points (N, 2), logarithm of the blur (N,) [px], width (N,) [steps] and contrast (N,); NaN where lost.
+
+    ``variance`` (N,) is that of the residuals [counts^2].
+    """
 
     pixels: FloatArray
     log_blur: FloatArray
     width: FloatArray
     contrast: FloatArray
+    variance: FloatArray
 
 
-def fit_points(windows: PointWindows, shared: Shared | None, *, with_contrast: bool) -> PointFits:
-    """Levenberg-Marquardt fit of all parameters of each point, or of places alone with ``shared`` ones given."""
+def fit_points(
+    windows: PointWindows, shared: Shared | None, *, with_contrast: bool, noise: float | None = None
+) -> PointFits:
+    """Levenberg-Marquardt fit of all parameters of each point, or of places alone with ``shared`` ones given.
+
+    Parameters
+    ----------
+    noise : standard deviation of residuals [counts]; pixels that deviate by more lose weight. None: all count alike
+    """
     parameters = np.zeros((len(windows.index), 4))
     if shared is None:
         parameters[:, 2] = np.log(np.maximum(_LEAST_BLUR, _BLUR / windows.scale.max(axis=1)))
@@ -47,10 +60,29 @@ def fit_points(windows: PointWindows, shared: Shared | None, *, with_contrast: b
         parameters[:, 2], parameters[:, 3] = shared
         free = 2
         windows = windows.with_neighbours_held(parameters)
+    enough = _CONVERGED_PX if with_contrast else _NEARLY_PX
+    state = _minimised(windows, parameters, free, enough)
+    whole = (windows.weight**2).sum(axis=1)
+    every = windows
+    for _ in range(0 if noise is None else _REWEIGHTED):
+        off = every.residuals(state.parameters, state.contrast) / np.maximum(every.weight, 1e-9)
+        windows = every.reweighted(1.0 / np.sqrt(1.0 + (off / (_DEVIATING * (noise or 1.0))) ** 2))
+        state = _minimised(windows, state.parameters, free, enough)
+    lost = ~_well_determined(windows, state) | ((windows.weight**2).sum(axis=1) < _LEAST_LEFT * whole)
+    if with_contrast:
+        lost |= ~((_CONTRAST[0] < state.contrast) & (state.contrast < _CONTRAST[1]))
+    variance = state.cost / _freedom(windows, free)
+    parts = windows.starts + state.parameters[:, :2], state.parameters[:, 2:], state.contrast, variance
+    values = np.column_stack(parts)
+    values[lost] = np.nan
+    return PointFits(values[:, :2], *values[:, 2:].T)
+
+
+def _minimised(windows: PointWindows, parameters: FloatArray, free: int, enough: float) -> '_CornerState':
+    """State after the fit from ``parameters`` (P, 4), whose last step is shorter than ``enough`` [px]."""
     state = _CornerState.at(windows, parameters, free)
     damping = np.full(len(parameters), _DAMPING)
     moving = np.arange(len(parameters))
-    enough = _CONVERGED_PX if with_contrast else _NEARLY_PX
     for _ in range(_MOST_STEPS):
         step = state.rows(moving).step(damping[moving])
         short = np.abs(step[:, :2]).max(axis=1) < enough
@@ -66,21 +98,19 @@ def fit_points(windows: PointWindows, shared: Shared | None, *, with_contrast: b
         moving = moving[(damping[moving] < _MOST_DAMPED) & (_moved(windows, state)[moving] < 2.0 * _MOST_MOVE)]
         if len(moving) == 0:
             break
-    lost = ~_well_determined(windows, state)
-    if with_contrast:
-        lost |= ~((_CONTRAST[0] < state.contrast) & (state.contrast < _CONTRAST[1]))
-    values = np.column_stack([windows.starts + state.parameters[:, :2], state.parameters[:, 2:], state.contrast])
-    values[lost] = np.nan
-    return PointFits(values[:, :2], *values[:, 2:].T)
+    return state
+
+
+def _freedom(windows: PointWindows, free: int) -> FloatArray:
+    return np.asarray(np.maximum(1.0, (windows.weight**2).sum(axis=1) - free - _LINEAR))
 
 
 def _well_determined(windows: PointWindows, state: '_CornerState') -> BoolArray:
     """Mask (P,) of the fits with a small standard deviation that end near their start."""
-    freedom = np.maximum(1.0, (windows.weight**2).sum(axis=1) - state.free - _LINEAR)
     # A ridge in place of the zeros of a fit without contrast, which determines nothing.
     ridge = 1e-12 * np.trace(state.normal, axis1=1, axis2=2) + 1e-30
     covariance = np.linalg.inv(state.normal + ridge[:, None, None] * np.eye(state.free + 1))
-    variance = state.cost / freedom * (covariance[:, 0, 0] + covariance[:, 1, 1])
+    variance = state.cost / _freedom(windows, state.free) * (covariance[:, 0, 0] + covariance[:, 1, 1])
     return np.asarray((variance < _MOST_SIGMA_PX**2) & (_moved(windows, state) < _MOST_MOVE))
 
 

@@ -26,6 +26,8 @@ _LEAST_POINTS = 6
 _SAMPLE, _FEW = 48, 8
 # Most samples, since a width far from the described one takes another window, and relative change that takes none.
 _MOST_SAMPLES, _SAME_WIDTH = 4, 0.05
+# Variance of the residuals, relative to the usual, of points that are fitted again without what deviates.
+_ODD = 3.0
 # Points and pixels per batch: enough for long rows, few enough for a processor's cache.
 _POINTS_AT_A_TIME, _PIXELS_AT_A_TIME = 160, 30000
 
@@ -80,6 +82,13 @@ def refine(
         return Refined(lost, *known)
     pixels = _next_starts(nodes, pixels, alike.pixels, every, grid)
     refined = _round(image, nodes, pixels, appearance, every, grid, shared, alike.contrast)
+    # Points whose windows hold something else too, the border of the board or a hand.
+    noise = float(np.sqrt(np.nanmedian(refined.variance))) if np.any(np.isfinite(refined.variance)) else 0.0
+    odd = np.flatnonzero(refined.variance > _ODD * noise**2)
+    if len(odd):
+        again = _round(image, nodes, pixels, appearance, odd, grid, shared, alike.contrast, noise)
+        for values, new in zip(refined, again, strict=True):
+            values[odd] = new[odd]
     enough = np.sum(np.isfinite(refined.contrast)) >= _LEAST_POINTS
     return Refined(refined.pixels if enough else lost, *known)
 
@@ -142,11 +151,12 @@ def _round(
     grid: BoolArray,
     shared: Shared | None,
     contrast: FloatArray | None,
+    noise: float | None = None,
 ) -> PointFits:
     """Fit points ``index`` once; with ``contrast``, points without one are lost and not used for the ``grid``."""
     known = grid if contrast is None else grid & np.isfinite(contrast)
     ridge = ROUGHLY if shared is None else CLOSELY
-    fits = PointFits(np.full_like(pixels, np.nan), *np.full((3, len(nodes)), np.nan))
+    fits = PointFits(np.full_like(pixels, np.nan), *np.full((4, len(nodes)), np.nan))
     for first in range(0, len(index), _POINTS_AT_A_TIME):
         part = index[first : first + _POINTS_AT_A_TIME]
         surfaces = local_surfaces(nodes[known], pixels[known], nodes[part], ridge)
@@ -157,7 +167,7 @@ def _round(
         for some in _few_pixels(windows):
             points = part[some.index]
             common = None if shared is None else Shared(*(values[points] for values in shared))
-            fitted = fit_points(some, common, with_contrast=contrast is not None)
+            fitted = fit_points(some, common, with_contrast=contrast is not None, noise=noise)
             for values, new in zip(fits, fitted, strict=True):
                 values[points] = new
     return fits

@@ -84,6 +84,21 @@ class PointWindows:
         among = rows @ rows.swapaxes(1, 2) - background @ background.swapaxes(1, 2)
         return among, (rows @ self.counts[..., None])[..., 0]
 
+    def residuals(self, parameters: FloatArray, contrast: FloatArray) -> FloatArray:
+        """Weighted residuals (P, N) of the counts, for fits of places alone, without their background."""
+        places = self.places - (self.inverse @ parameters[:, :2, None]).swapaxes(1, 2)
+        values, _ = self.appearance.shape(places, self._blur(parameters), parameters[:, 3], 0)
+        rows = (values + self.beside) * self.weight * self.expected
+        rows -= (self.ground @ (self.ground.swapaxes(1, 2) @ rows[..., None]))[..., 0]
+        return np.asarray(self.counts - contrast[:, None] * rows)
+
+    def reweighted(self, factor: FloatArray) -> 'PointWindows':
+        """Windows whose weights are multiplied by a ``factor`` (P, N)."""
+        ground = np.linalg.qr(self.ground * factor[..., None])[0]
+        counts = self.counts * factor
+        counts -= (ground @ (ground.swapaxes(1, 2) @ counts[..., None]))[..., 0]
+        return replace(self, weight=self.weight * factor, ground=ground, counts=counts)
+
     def with_neighbours_held(self, parameters: FloatArray) -> 'PointWindows':
         """Windows for fits of places alone, with the neighbours fixed at their grid positions."""
         return replace(self, beside=self.appearance.beside(self.places, self._blur(parameters), parameters[:, 3]))
