@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from thermal_fiducial.calibration.lens_fit import camera_parameters, LensFit
+from thermal_fiducial.calibration.lens_fit import camera_parameters, LensFit, MATRIX
 from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, MODELS
@@ -31,7 +31,8 @@ class Calibration:
     ----------
     camera : with the estimated intrinsics
     free : coefficients that were estimated; the others are zero
-    covariance : (4 + D, 4 + D) of fx fy cx cy and the distortion coefficients, what those at zero may be included
+    covariance : (4 + D, 4 + D) of fx fy cx cy and the distortion coefficients, what those at zero may be included; two
+        more for the decentring of models without tangential coefficients
     T_camera_board : (V, 4, 4)
     residuals : V arrays (N, 2) measured minus predicted [px]
     views : (V,) indices of the sightings that were used
@@ -57,7 +58,7 @@ class Calibration:
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviations of fx fy cx cy and the distortion coefficients."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)))
+        return np.asarray(np.sqrt(np.diag(self.covariance))[: MATRIX + len(self.camera.D)])
 
     def parameter_rows(self) -> list[tuple[str, float, float]]:
         """Name, value and standard deviation of every intrinsic parameter."""

@@ -73,7 +73,7 @@ class ImageError:
 
 
 def image_error(camera: Camera, covariance: FloatArray, sightings: Sequence[Sighting]) -> ImageError:
-    """Error of a pixel's place, over the image, from the covariance (4 + D, 4 + D) of the intrinsics.
+    """Error of a pixel's place, over the image, from the covariance of a :class:`Calibration`.
 
     A rotation of the whole camera is not a lens error: the one that fits best where the views are is removed.
     """

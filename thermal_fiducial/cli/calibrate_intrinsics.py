@@ -174,7 +174,7 @@ def _save_covariance(out: Path, result: Calibration, error: ImageError) -> None:
     document = {
         'parameters': [name for name, _, _ in rows],
         'sigma': [sigma for _, _, sigma in rows],
-        'covariance': result.covariance.tolist(),
+        'covariance': result.covariance[: len(rows), : len(rows)].tolist(),
         'rms_px': result.rms_px,
         'held_out_rms_px': result.held_out_px[0],
         'held_out_standard_error_px': result.held_out_px[1],
