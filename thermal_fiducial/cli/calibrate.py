@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermal_fiducial.calibration.sources import clean_frames, imu_track, RawFrame, recorded_camera
+from thermal_fiducial.calibration.sources import clean_frames, imu_track, recorded_camera
 from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
@@ -20,10 +20,11 @@ from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MarkerMap
-from thermal_fiducial.core.measurements import corner_covariances, corners_px
+from thermal_fiducial.core.measurements import corner_covariances, corners_px, Markers
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, parse_remaps
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, MARKERS_TOPIC, parse_remaps
 from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.images import stamp_to_ns
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
@@ -56,7 +57,10 @@ def run(args: argparse.Namespace) -> int:
 def _add_camera_imu(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(do=_camera_imu)
     parser.add_argument(
-        'bag', type=Path, metavar='BAG', help='bag with thermal/image_raw and imu/data, moving before mapped markers'
+        'bag',
+        type=Path,
+        metavar='BAG',
+        help='bag with thermal/image_raw (or markers, their corners) and imu/data, moving before mapped markers',
     )
     parser.add_argument('--map', type=Path, required=True, metavar='FILE', help='marker map (YAML)')
     parser.add_argument(
@@ -88,11 +92,11 @@ def _camera_imu(args: argparse.Namespace) -> int:
     )
     marker_map = load_map(args.map)
     with BagReader(args.bag, parse_remaps(args.remap)) as bag:
-        camera = recorded_camera(bag) if args.calibration is None else load_camera(args.calibration)
+        camera = _camera_of(bag, args.calibration)
         imu, start_ns = imu_track(bag)
-        frames = tracked(clean_frames(bag), 'finding markers', bag.message_count([bag.image_topic]))
         detector = mapped_detector(marker_map, args.plate_thickness)
-        seen = sorted(_mapped_corners(frames, detector, marker_map, camera), key=lambda frame: frame.stamp_ns)
+        found = _recorded_rows(bag) if _has_corners_only(bag) else _detected_rows(bag, detector, camera)
+        seen = sorted(_mapped_corners(found, marker_map), key=lambda frame: frame.stamp_ns)
     if not seen:
         raise InputError(f'{args.bag}: no frame shows a marker of {args.map}, which are of {marker_map.dictionary}')
     with naming(args.bag):
@@ -103,21 +107,52 @@ def _camera_imu(args: argparse.Namespace) -> int:
     return 0
 
 
-def _mapped_corners(
-    frames: Iterable[RawFrame], detector: MarkerDetector, marker_map: MarkerMap, camera: Camera
-) -> Iterator['FrameCorners']:
+def _camera_of(bag: BagReader, calibration: Path | None) -> Camera:
+    """Camera of a file, else of the bag; both have images of one size."""
+    if calibration is None:
+        return recorded_camera(bag)
+    camera = load_camera(calibration)
+    if CAMERA_INFO_TOPIC in bag.topics:
+        there = recorded_camera(bag)
+        if (there.width, there.height) != (camera.width, camera.height):
+            sizes = f'{camera.width}x{camera.height} pixels, the bag of {there.width}x{there.height}'
+            raise InputError(f'{calibration}: a calibration of {sizes}')
+    return camera
+
+
+def _has_corners_only(bag: BagReader) -> bool:
+    """Whether the bag has the corners of markers instead of images, as those of ``import`` do."""
+    return bag.image_topic not in bag.topics and MARKERS_TOPIC in bag.topics
+
+
+def _detected_rows(bag: BagReader, detector: MarkerDetector, camera: Camera) -> Iterator[tuple[int, Markers]]:
+    """Stamps and detections of the frames of a bag."""
+    for frame in tracked(clean_frames(bag), 'finding markers', bag.message_count([bag.image_topic])):
+        yield frame.stamp_ns, detector.detect(frame.stamp_ns, frame.counts, camera)
+
+
+def _recorded_rows(bag: BagReader) -> Iterator[tuple[int, Markers]]:
+    """Stamps and detections that a bag holds."""
+    # Needs ROS, which the other calibrations do without.
+    from thermal_fiducial.ros.messages.clouds import markers
+
+    bag.require({MARKERS_TOPIC: 'sensor_msgs/msg/PointCloud2'})
+    for entry in bag.messages([MARKERS_TOPIC]):
+        yield stamp_to_ns(entry.message.header.stamp), markers(entry.message)
+
+
+def _mapped_corners(found: Iterable[tuple[int, Markers]], marker_map: MarkerMap) -> Iterator['FrameCorners']:
     """Detections of mapped markers, frames without any left out."""
     from thermal_fiducial.calibration.rolling import FrameCorners
 
-    for frame in frames:
-        rows = detector.detect(frame.stamp_ns, frame.counts, camera)
+    for stamp_ns, rows in found:
         rows = rows[np.isin(rows['id'], list(marker_map.markers))]
         if len(rows) == 0:
             continue
         markers = [marker_map.markers[marker_id] for marker_id in rows['id'].tolist()]
         T_map_marker = np.stack([marker.T_map_marker for marker in markers])
         sizes = np.array([marker.size for marker in markers])
-        yield FrameCorners(frame.stamp_ns, corners_px(rows), corner_covariances(rows), T_map_marker, sizes)
+        yield FrameCorners(stamp_ns, corners_px(rows), corner_covariances(rows), T_map_marker, sizes)
 
 
 def _extrinsics_std(result: 'CameraImuCalibration') -> tuple[float, float]:

@@ -207,4 +207,5 @@ def _print_result(
         print(f'{name} = {value:.6g} +- {sigma:.2g}')
     dropped = ', '.join(views.kept[index].name for index in result.dropped) or 'none'
     print(error.sentence())
-    print(f'{out}: {result.lens_name()}, rms {result.rms_px:.4f} px, {len(result.views)} views, dropped: {dropped}')
+    seen = f'{len(result.views)} views of {len(views.kept) + len(views.unusable)} frames, dropped by the fit: {dropped}'
+    print(f'{out}: {result.lens_name()}, rms {result.rms_px:.4f} px, {seen}')

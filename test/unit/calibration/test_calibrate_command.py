@@ -1,18 +1,34 @@
 """``calibrate`` on bags: reading, choosing views, refusing."""
 
+from builtin_interfaces.msg import Time
 import cv2
 import numpy as np
 import pytest
+from std_msgs.msg import Header
 from support.boards import chessboard_levels, plate_pose, random_view, render
-from support.small_bag import camera_info, image, Recording, recording, side_files, START_NS, T_BODY_CAMERA
+from support.small_bag import (
+    CAMERA,
+    camera_info,
+    image,
+    Raw,
+    Recording,
+    recording,
+    side_files,
+    START_NS,
+    T_BODY_CAMERA,
+)
 import yaml
 
 from thermal_fiducial.calibration.targets import Chessboard
+from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera, save_camera
+from thermal_fiducial.files.images import image_to_array, stamp_to_ns
+from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.ros.messages.clouds import MARKER_CLOUDS
 from thermal_fiducial.sim.lens import Lens
 
 #: A quarter of a Tau 2's pixels: a board is found in a quarter of the time.
@@ -44,6 +60,30 @@ def test_camera_against_imu(tmp_path, capsys):
     assert 'turns about all three axes' in printed.err
 
 
+def with_corners_instead_of_images(images, marker_map):
+    """A recording in which detections stand for the images, as in those of ``import``."""
+    detector, corners = mapped_detector(load_map(marker_map)), images.without(IMAGE_TOPIC)
+    for message in images.of(IMAGE_TOPIC):
+        stamp_ns = stamp_to_ns(message.header.stamp)
+        rows = detector.detect(stamp_ns, image_to_array(message), CAMERA)
+        head = Header(stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9))
+        data = MARKER_CLOUDS.message(rows, head)
+        corners.events.append((stamp_ns, MARKERS_TOPIC, Raw('sensor_msgs/msg/PointCloud2', data)))
+    return corners
+
+
+def test_camera_against_imu_by_recorded_corners(tmp_path):
+    marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
+    bag = with_corners_instead_of_images(recording(seconds=4.2), marker_map).write(tmp_path / 'bag')
+    out = tmp_path / 'extrinsics.yaml'
+    assert main(['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--out', str(out)]) == 0
+    found = yaml.safe_load(out.read_text())['/**']['ros__parameters']
+    R = se3.rotation_from_quaternion(found['camera_orientation'])
+    # As with the images: see above.
+    assert np.degrees(se3.rotation_angle(R.T @ T_BODY_CAMERA[:3, :3])) < 1.0
+    assert 0.0 < found['camera_time_offset'] < 0.02
+
+
 def test_camera_against_imu_names_the_dictionary_that_no_frame_shows(tmp_path, capsys):
     bag = recording(seconds=0.2).write(tmp_path / 'bag')
     marker_map, _ = side_files(tmp_path, ids=(0, 1))
@@ -60,7 +100,7 @@ def test_camera_against_imu_refuses_a_calibration_of_another_size(tmp_path, caps
     save_camera(lens, Camera(320, 256, np.array([[400.0, 0.0, 160.0], [0.0, 400.0, 128.0], [0.0, 0.0, 1.0]])))
     words = ['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--calibration', str(lens)]
     assert main([*words, '--out', str(out)]) == 2
-    assert 'image of 640x512, camera_info of 320x256 pixels' in capsys.readouterr().err
+    assert 'lens.yaml: a calibration of 320x256 pixels, the bag of 640x512' in capsys.readouterr().err
 
 
 def _axes_of(text, name):
