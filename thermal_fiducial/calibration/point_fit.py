@@ -61,13 +61,11 @@ def fit_points(
         free = 2
         windows = windows.with_neighbours_held(parameters)
     enough = _CONVERGED_PX if with_contrast else _NEARLY_PX
-    state = _minimised(windows, parameters, free, enough)
     whole = (windows.weight**2).sum(axis=1)
-    every = windows
-    for _ in range(0 if noise is None else _REWEIGHTED):
-        off = every.residuals(state.parameters, state.contrast) / np.maximum(every.weight, 1e-9)
-        windows = every.reweighted(1.0 / np.sqrt(1.0 + (off / (_DEVIATING * (noise or 1.0))) ** 2))
-        state = _minimised(windows, state.parameters, free, enough)
+    if noise is None:
+        state = _minimised(windows, parameters, free, enough)
+    else:
+        windows, state = _without_deviating(windows, parameters, noise, enough)
     lost = ~_well_determined(windows, state) | ((windows.weight**2).sum(axis=1) < _LEAST_LEFT * whole)
     if with_contrast:
         lost |= ~((_CONTRAST[0] < state.contrast) & (state.contrast < _CONTRAST[1]))
@@ -76,6 +74,23 @@ def fit_points(
     values = np.column_stack(parts)
     values[lost] = np.nan
     return PointFits(values[:, :2], *values[:, 2:].T)
+
+
+def _without_deviating(
+    windows: PointWindows, parameters: FloatArray, noise: float, enough: float
+) -> tuple[PointWindows, '_CornerState']:
+    """Windows in which deviating pixels have less weight, and the fit of places to them.
+
+    The first weights are those at the start, with the contrast of the neighbours: a fit to all pixels would go towards
+    what deviates, and lose weight for the rest.
+    """
+    every, contrast = windows, np.ones(len(parameters))
+    for _ in range(_REWEIGHTED):
+        off = every.residuals(parameters, contrast) / np.maximum(every.weight, 1e-9)
+        windows = every.reweighted(1.0 / np.sqrt(1.0 + (off / (_DEVIATING * noise)) ** 2))
+        state = _minimised(windows, parameters, 2, enough)
+        parameters, contrast = state.parameters, state.contrast
+    return windows, state
 
 
 def _minimised(windows: PointWindows, parameters: FloatArray, free: int, enough: float) -> '_CornerState':

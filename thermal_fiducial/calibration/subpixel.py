@@ -86,6 +86,9 @@ def refine(
     noise = float(np.sqrt(np.nanmedian(refined.variance))) if np.any(np.isfinite(refined.variance)) else 0.0
     odd = np.flatnonzero(refined.variance > _ODD * noise**2)
     if len(odd):
+        others = refined.pixels.copy()
+        others[odd] = np.nan
+        pixels = _next_starts(nodes, pixels, others, every, grid)
         again = _round(image, nodes, pixels, appearance, odd, grid, shared, alike.contrast, noise)
         for values, new in zip(refined, again, strict=True):
             values[odd] = new[odd]
