@@ -24,6 +24,8 @@ from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
 _RING = 0.5
 # Place of the end of the warm surface outside the sides [cells].
 _SURFACE_ENDS = 1.0
+#: Place of the bowl of the warm surface among the linear terms, and its value at the corners of the marker.
+BOWL, BOWL_AT_CORNERS = 4, 0.5
 # Cumulative standard normal distribution, by a table.
 _FARTHEST = 6.0
 _Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
@@ -126,8 +128,8 @@ class PatternResiduals(NamedTuple):
     #: (Q, P) gray levels, and these without the pattern; no background in either
     seen: Float32Array
     rest: Float32Array
-    #: (Q,)
-    contrast: FloatArray
+    #: (Q, L) amounts of the linear terms, the first of them the contrast
+    amounts: FloatArray
     #: (Q, 9 + L, P) derivatives by the corners' u and v, by blur, and by the L linear terms, with background
     J: Float32Array
     grid: PatternGrid
@@ -136,6 +138,11 @@ class PatternResiduals(NamedTuple):
         """Information (Q, 9 + L, 9 + L) of samples with a variance of 1, whatever the background."""
         hidden = self.J @ self.grid.background
         return np.asarray(self.J @ self.J.swapaxes(1, 2) - hidden @ hidden.swapaxes(1, 2), dtype=np.float64)
+
+    @property
+    def contrast(self) -> FloatArray:
+        """White minus black (Q,), in the middle of the marker."""
+        return self.amounts[:, 0]
 
     @property
     def pixels(self) -> FloatArray:
@@ -167,7 +174,7 @@ def linearised(
     contrast = amounts[:, 0].astype(np.float32)
     if grid.graded:
         contrast = contrast + amounts[:, 1:3, 0].astype(np.float32) @ grid.middle
-        contrast = contrast + amounts[:, 4].astype(np.float32) * grid.bowl
+        contrast = contrast + amounts[:, BOWL].astype(np.float32) * grid.bowl
     if view.displayed and grid.graded:
         contrast = contrast + amounts[:, 5].astype(np.float32) * (1.0 + 2.0 * model.value)
     # Steps of an alignment are long: what of the slopes looks like background is not trusted.
@@ -176,7 +183,7 @@ def linearised(
     J = np.empty((count, 9 + terms.shape[1], seen.shape[1]), dtype=np.float32)
     np.multiply(by_px[:, :, None], grid.weights, out=J[:, :8].reshape(count, 2, 4, -1))
     J[:, 8], J[:, 9:] = -contrast * model.wider, -terms
-    return PatternResiduals(quads, blur, to_cells, x, y, seen, rest, amounts[:, 0, 0], J, grid)
+    return PatternResiduals(quads, blur, to_cells, x, y, seen, rest, amounts[..., 0], J, grid)
 
 
 def _model(

@@ -15,7 +15,14 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.blurred_patterns import linearised, pattern_grid, PatternResiduals, PatternView
+from thermal_fiducial.core.detection.blurred_patterns import (
+    BOWL,
+    BOWL_AT_CORNERS,
+    linearised,
+    pattern_grid,
+    PatternResiduals,
+    PatternView,
+)
 from thermal_fiducial.core.detection.corner_errors import OF_DISPLAYED_PATTERN_PX, OF_PATTERN_PX
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.detection.frame import Frame
@@ -48,6 +55,11 @@ _LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.15, (0.5, 2.0)
 # Standard deviation of the blur, in blurs of the optics: the focus. That of the corners from where they are looked for
 # [cells].
 _FOCUS, _START = 0.3, 0.5
+# Standard deviation of what the warm surface falls by, from the middle of a marker to its corners, as a share of the
+# contrast. Where a heater ends 5 cm inside the edge of its sheet, that edge is 6 to 11 % cooler: 1 - 1 / cosh of 5 cm
+# over sqrt(k t / h), for t = 2 to 1 mm of aluminium, k = 200 W/(m K), and h = 20 W/(m2 K) of still air and radiation on
+# both sides (F. Incropera, D. DeWitt, "Fundamentals of Heat and Mass Transfer", on fins).
+_UNEVEN = 0.1
 # Parameters of a fit: corners, blur, contrast, warm surface, background. A fit to something that is not there makes use
 # of fewer, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 it is higher
 # below 8.
@@ -81,6 +93,9 @@ class _Prior(NamedTuple):
         off = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
         gradient[:, :8, 0] += of_corner[:, None] * off
         gradient[:, 8, 0] += of_blur * (at.blur - self.blur_px)
+        of_bowl = share / ((_UNEVEN / BOWL_AT_CORNERS * at.contrast) ** 2 + TINY)
+        information[:, 9 + BOWL, 9 + BOWL] += of_bowl
+        gradient[:, 9 + BOWL, 0] += of_bowl * at.amounts[:, BOWL]
         return _solvable(information), gradient
 
 
