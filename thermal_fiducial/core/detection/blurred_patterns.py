@@ -96,14 +96,6 @@ class PatternView(NamedTuple):
         return np.asarray(shown, dtype=np.float32)
 
 
-class CellWeights(NamedTuple):
-    """Weights (Q, S, m) of cells at samples along an axis, and their first and second derivatives by place."""
-
-    value: Float32Array
-    slope: Float32Array
-    curvature: Float32Array
-
-
 class PatternModel(NamedTuple):
     """Blurred patterns of Q markers, (Q, P) each."""
 
@@ -122,9 +114,9 @@ class PatternResiduals(NamedTuple):
     blur: FloatArray
     #: (Q, 2, 2) derivatives of places in the marker [cells] by pixels
     to_cells: FloatArray
-    #: of cells along rows and along columns
-    x: CellWeights
-    y: CellWeights
+    #: (Q, S, m) weights of cells at samples along rows and along columns
+    x: Float32Array
+    y: Float32Array
     #: (Q, P) gray levels, and these without the pattern; no background in either
     seen: Float32Array
     rest: Float32Array
@@ -133,6 +125,12 @@ class PatternResiduals(NamedTuple):
     #: (Q, 9 + L, P) derivatives by the corners' u and v, by blur, and by the L linear terms, with background
     J: Float32Array
     grid: PatternGrid
+
+    def seen_at(self, view: PatternView, quads: FloatArray) -> 'PatternResiduals':
+        """The same at corners ``quads`` (Q, 4, 2) so near that the patterns on the markers stay."""
+        seen = self.grid.without_background(view.gray(quads, self.grid))
+        amounts, rest = _fitted(-self.J[:, 9:], seen)
+        return self._replace(corners_px=quads, seen=seen, rest=rest, amounts=amounts)
 
     def information(self) -> FloatArray:
         """Information (Q, 9 + L, 9 + L) of samples with a variance of 1, whatever the background."""
@@ -147,7 +145,8 @@ class PatternResiduals(NamedTuple):
     @property
     def pixels(self) -> FloatArray:
         """Pixels (Q,) that the samples cover."""
-        return np.asarray(self.seen.shape[1] / self.grid.density**2 / np.abs(np.linalg.det(self.to_cells)))
+        (xu, xv), (yu, yv) = np.moveaxis(self.to_cells, 0, -1)
+        return np.asarray(self.seen.shape[1] / self.grid.density**2 / np.abs(xu * yv - xv * yu))
 
 
 def linearised(
@@ -164,31 +163,42 @@ def linearised(
     if view.motion is not None:
         moved = to_cells @ view.motion[..., None]
         spread = spread + moved @ moved.swapaxes(1, 2)
-    x, y = (_weights(grid.along, cells, np.sqrt(spread[:, axis, axis])) for axis in (0, 1))
+    x, y = _weights(grid.along, cells, np.sqrt(np.einsum('qii->iq', spread)))
     model = _model(x, y, white, *(part.astype(np.float32) for part in (spread, blur, of_optics)))
     seen = grid.without_background(view.gray(quads, grid))
     terms = grid.without_background(_linear_terms(model, spread, grid, cells, displayed=view.displayed))
-    products = np.asarray(terms @ terms.swapaxes(1, 2), dtype=np.float64) + TINY * np.eye(terms.shape[1])
-    amounts = np.linalg.solve(products, terms @ seen[..., None])
-    rest = seen - (terms.swapaxes(1, 2) @ amounts.astype(np.float32))[..., 0]
-    contrast = amounts[:, 0].astype(np.float32)
-    if grid.graded:
-        contrast = contrast + amounts[:, 1:3, 0].astype(np.float32) @ grid.middle
-        contrast = contrast + amounts[:, BOWL].astype(np.float32) * grid.bowl
-    if view.displayed and grid.graded:
-        contrast = contrast + amounts[:, 5].astype(np.float32) * (1.0 + 2.0 * model.value)
+    amounts, rest = _fitted(terms, seen)
+    contrast = _contrast(amounts.astype(np.float32), model, grid, displayed=view.displayed)
     # Steps of an alignment are long: what of the slopes looks like background is not trusted.
     slopes = model.slopes if grid.graded else grid.without_background(model.slopes)
     by_px = to_cells.swapaxes(1, 2).astype(np.float32) @ (slopes * contrast).swapaxes(0, 1)
     J = np.empty((count, 9 + terms.shape[1], seen.shape[1]), dtype=np.float32)
     np.multiply(by_px[:, :, None], grid.weights, out=J[:, :8].reshape(count, 2, 4, -1))
     J[:, 8], J[:, 9:] = -contrast * model.wider, -terms
-    return PatternResiduals(quads, blur, to_cells, x, y, seen, rest, amounts[..., 0], J, grid)
+    return PatternResiduals(quads, blur, to_cells, x[:, 0], y[:, 0], seen, rest, amounts, J, grid)
+
+
+def _fitted(terms: Float32Array, seen: Float32Array) -> tuple[FloatArray, Float32Array]:
+    """Amounts (Q, L) of linear terms (Q, L, P) in gray levels (Q, P), and what they leave of these."""
+    products = np.asarray(terms @ terms.swapaxes(1, 2), dtype=np.float64) + TINY * np.eye(terms.shape[1])
+    amounts = np.linalg.solve(products, terms @ seen[..., None])
+    rest = seen - (terms.swapaxes(1, 2) @ amounts.astype(np.float32))[..., 0]
+    return np.asarray(amounts[..., 0]), np.asarray(rest)
+
+
+def _contrast(amounts: Float32Array, model: PatternModel, grid: PatternGrid, *, displayed: bool) -> Float32Array:
+    """White minus black (Q, P or 1) where the samples are, by the amounts (Q, L) of the linear terms."""
+    if not grid.graded:
+        return amounts
+    contrast = amounts[:, :1] + amounts[:, 1:3] @ grid.middle + amounts[:, BOWL, None] * grid.bowl
+    if displayed:
+        contrast += amounts[:, 5:] * (1.0 + 2.0 * model.value)
+    return np.asarray(contrast)
 
 
 def _model(
-    x: CellWeights,
-    y: CellWeights,
+    x: Float32Array,
+    y: Float32Array,
     white: FloatArray,
     spread: Float32Array,
     blur: Float32Array,
@@ -196,22 +206,23 @@ def _model(
 ) -> PatternModel:
     """Patterns, 0 for white and -1 for black, with a blur of covariance ``spread`` (Q, 2, 2) [cells^2].
 
-    ``of_optics`` (Q, 2, 2): its derivative by the variance of the optics.
+    Parameters
+    ----------
+    x, y : (Q, 3, S, m) of :func:`_weights` along rows and along columns
+    of_optics : (Q, 2, 2) derivative of ``spread`` by the variance of the optics
     """
+    count, orders, samples, cells = x.shape
     black = (white - 1.0).astype(np.float32)
-
-    def shown(down: Float32Array, across: Float32Array) -> Float32Array:
-        return np.asarray((down @ black @ across.swapaxes(1, 2)).reshape(len(black), -1))
-
+    # All derivatives down and across by two products: numpy takes longer to call than to multiply.
+    drawn = y.reshape(count, -1, cells) @ black @ x.reshape(count, -1, cells).swapaxes(1, 2)
+    shown = drawn.reshape(count, orders, samples, orders, samples).transpose(1, 3, 0, 2, 4)
+    (value, by_x, by_xx), (by_y, by_xy, by_xxy), (by_yy, by_xyy, by_xxyy) = shown.reshape(orders, orders, count, -1)
     c = spread[:, :1, 1]
-    twisted = shown(y.slope, x.slope)
-    value = shown(y.value, x.value) + c * (twisted + np.float32(0.5) * c * shown(y.curvature, x.curvature))
-    slope_x = shown(y.value, x.slope) + c * shown(y.slope, x.curvature)
-    slope_y = shown(y.slope, x.value) + c * shown(y.curvature, x.slope)
+    shape = value + c * (by_xy + np.float32(0.5) * c * by_xxyy)
+    slopes = np.stack([by_x + c * by_xxy, by_y + c * by_xyy])
     # Blur spreads a pattern as heat does: its derivative by a variance is half its curvature.
-    wider = of_optics[:, :1, 0] * shown(y.value, x.curvature) + of_optics[:, 1:, 1] * shown(y.curvature, x.value)
-    wider = blur[:, None] * (wider + np.float32(2.0) * of_optics[:, :1, 1] * twisted)
-    return PatternModel(value, np.stack([slope_x, slope_y]), wider)
+    wider = of_optics[:, :1, 0] * by_xx + of_optics[:, 1:, 1] * by_yy + np.float32(2.0) * of_optics[:, :1, 1] * by_xy
+    return PatternModel(shape, slopes, blur[:, None] * wider)
 
 
 def _linear_terms(
@@ -228,7 +239,7 @@ def _linear_terms(
     displaced = (spread / cells).astype(np.float32) @ model.slopes.swapaxes(0, 1)
     graded = model.value[:, None] * grid.middle + displaced
     outside = np.array([-_SURFACE_ENDS, cells + _SURFACE_ENDS])
-    x, y = (_between(outside, grid.along, np.sqrt(spread[:, axis, axis])) for axis in (0, 1))
+    x, y = _between(outside, grid.along, np.sqrt(np.einsum('qii->iq', spread)))
     surface = (y[:, :, None] * x[:, None]).reshape(len(spread), 1, -1)
     bowl = grid.bowl * (1.0 + model.value) + 2.0 * (grid.middle * displaced).sum(axis=1)
     terms = [model.value[:, None], graded, surface, bowl[:, None]]
@@ -238,9 +249,9 @@ def _linear_terms(
 
 
 def _between(ends: FloatArray, along: FloatArray, blur: FloatArray) -> Float32Array:
-    """Share (Q, S) of a stretch between two ``ends`` (2,) at places ``along`` (S,), for ``blur`` (Q,) [cells]."""
-    below = np.interp((ends[:, None, None] - along) / blur[:, None], _Z, _BELOW)
-    return np.asarray(below[1] - below[0], dtype=np.float32)
+    """Share (..., S) of a stretch between two ``ends`` (2,) at places ``along`` (S,), for ``blur`` (...) [cells]."""
+    below = np.interp((ends[:, None] - along) / blur[..., None, None], _Z, _BELOW)
+    return np.asarray(below[..., 1, :] - below[..., 0, :], dtype=np.float32)
 
 
 def _to_cells(quads: FloatArray, cells: int) -> FloatArray:
@@ -254,11 +265,10 @@ def _to_cells(quads: FloatArray, cells: int) -> FloatArray:
     return np.asarray(np.linalg.inv(to_px))
 
 
-def _weights(along: FloatArray, cells: int, blur: FloatArray) -> CellWeights:
-    """Weights of cells at places ``along`` (S,) for ``blur`` (Q,) [cells]."""
-    width = blur[:, None, None]
+def _weights(along: FloatArray, cells: int, blur: FloatArray) -> Float32Array:
+    """Weights of cells at places ``along`` (S,) for ``blur`` (...) [cells], and two derivatives, (..., 3, S, m)."""
+    width = blur[..., None, None]
     # So far off nothing is left, but no number in single precision is too small.
     z = np.clip((np.arange(cells + 1) - along[:, None]) / width, -_FARTHEST, _FARTHEST)
-    density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-    weights = np.diff(np.interp(z, _Z, _BELOW)), -np.diff(density) / width, -np.diff(z * density) / width**2
-    return CellWeights(*(weight.astype(np.float32) for weight in weights))
+    density = np.exp(-0.5 * z * z) / (math.sqrt(2.0 * math.pi) * width)
+    return np.diff(np.stack([np.interp(z, _Z, _BELOW), -density, -z * density / width], axis=-3)).astype(np.float32)

@@ -41,9 +41,13 @@ _NARROW = 6.0
 # Largest distance of samples [px], and least number of them along a cell: 0.85 px gives no better corners.
 _APART_PX, _FEWEST = 1.0, 3
 # Steps of a fit, and length of the step of a corner after which there is no further one [px]. Size and focus converge
-# slowly together: where the camera is out of focus a limit of 0.05 px leaves 1 to 3 per mille of the size, 0.02 px half
-# of that.
+# slowly together: 0.03 px would leave 0.2 per mille more of the size of 22 px.
 _STEPS, _CONVERGED_PX = 8, 0.02
+# Length of a step of the corners [px], and distance of the blur from that of the pattern as it is modelled [blurs of
+# the optics], up to which that is still the same: the image is sampled again, and nothing else. After 0.3 px, markers
+# out of focus would be off by 0.5 to 1.3 per mille. The pattern of a blur that is a third too small makes them 4 per
+# mille too large, and the error is a square.
+_SAME_PX, _SAME_BLUR = 0.1, 0.05
 # Steps of an alignment. Damping: share of the information's diagonal that is added to it.
 _OF_ALIGNMENT, _DAMPING = 3, 0.1
 # Blur of the pattern in an alignment, so wide that it reaches an edge half a cell away [cells].
@@ -51,7 +55,7 @@ _WIDE = 0.25
 # Smoothing of the image for it, in pixels and at most in cells; least width of cells [px].
 _SMOOTHING_PX, _SMOOTHING, _LEAST_CELL_PX = 1.0, 0.4, 0.5
 # Longest step of a corner [cells] and of the blur, and range of the blur, both in blurs of the optics.
-_LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.15, (0.5, 2.0)
+_LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.3, (0.5, 2.0)
 # Standard deviation of the blur, in blurs of the optics: the focus. That of the corners from where they are looked for
 # [cells].
 _FOCUS, _START = 0.3, 0.5
@@ -83,20 +87,22 @@ class _Prior(NamedTuple):
     corners_std: FloatArray
     blur_px: float
 
-    def normal_equations(self, at: PatternResiduals) -> tuple[FloatArray, FloatArray]:
-        """With it, (Q, K, K), (Q, K, 1), for samples with a variance of 1."""
-        information, gradient = at.information(), _gradient(at)
-        share = _variance_of_samples(at, self.blur_px)
-        of_corner, of_blur = share / self.corners_std**2, share / (_FOCUS * self.blur_px) ** 2
-        np.einsum('qii->qi', information)[:, :8] += of_corner[:, None]
-        information[:, 8, 8] += of_blur
-        off = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
-        gradient[:, :8, 0] += of_corner[:, None] * off
-        gradient[:, 8, 0] += of_blur * (at.blur - self.blur_px)
-        of_bowl = share / ((_UNEVEN / BOWL_AT_CORNERS * at.contrast) ** 2 + TINY)
-        information[:, 9 + BOWL, 9 + BOWL] += of_bowl
-        gradient[:, 9 + BOWL, 0] += of_bowl * at.amounts[:, BOWL]
-        return _solvable(information), gradient
+    def normal_equations(self, at: PatternResiduals, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """With it, (Q, K, K), (Q, K, 1), for samples with a variance of 1, whose information is ``seen`` (Q, K, K)."""
+        precision, off = self._precision(at), np.zeros(at.J.shape[:2])
+        off[:, :8] = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
+        off[:, 8], off[:, 9 + BOWL] = at.blur - self.blur_px, at.amounts[:, BOWL]
+        information = seen.copy()
+        np.einsum('qii->qi', information)[:] += precision
+        return _solvable(information), _gradient(at) + (precision * off)[..., None]
+
+    def _precision(self, at: PatternResiduals) -> FloatArray:
+        """Inverse variances (Q, K), for samples with a variance of 1."""
+        precision = np.zeros(at.J.shape[:2])
+        precision[:, :8] = 1.0 / self.corners_std[:, None] ** 2
+        precision[:, 8] = 1.0 / (_FOCUS * self.blur_px) ** 2
+        precision[:, 9 + BOWL] = 1.0 / ((_UNEVEN / BOWL_AT_CORNERS * at.contrast) ** 2 + TINY)
+        return precision * _variance_of_samples(at, self.blur_px)[:, None]
 
 
 class PatternFit(NamedTuple):
@@ -158,14 +164,21 @@ def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: D
     cell = sides_px(quads) / decoder.cells
     grid = pattern_grid(decoder.cells, max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX)))
     prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
-    for _ in range(_STEPS):
-        at = linearised(view, quads, blur, white, grid)
-        information, product = prior.normal_equations(at)
+    at = linearised(view, quads, blur, white, grid)
+    seen = at.information()
+    for left in reversed(range(_STEPS)):
+        information, product = prior.normal_equations(at, seen)
         move = _step(information, product)
         quads, blur = _moved(at, move, blur_px)
         step = np.abs(quads - at.corners_px).max(axis=(1, 2))
-        if step.max(initial=0.0) < _CONVERGED_PX:
+        longest, other = step.max(initial=0.0), np.abs(blur - at.blur).max(initial=0.0) > _SAME_BLUR * blur_px
+        if (longest < _CONVERGED_PX and not other) or left == 0:
             break
+        if longest > _SAME_PX or other:
+            at = linearised(view, quads, blur, white, grid)
+            seen = at.information()
+        else:
+            at = at.seen_at(view, quads)
     # The last step is so short that it changes residuals linearly.
     hidden = grid.without_background((at.J.swapaxes(1, 2) @ move[..., None].astype(np.float32))[..., 0])
     at = at._replace(rest=at.rest + hidden)
@@ -278,7 +291,7 @@ def _content(at: PatternResiduals, cells: int) -> FloatArray:
     """Share (Q,) of the variance that a border around a plain square, each of any gray, leaves: that of the bits."""
     inner = np.pad(np.ones((cells - 2, cells - 2)), 1)
     squares = np.stack([np.ones((cells, cells)), inner])
-    drawn = at.y.value[:, None] @ squares @ at.x.value.swapaxes(1, 2)[:, None]
+    drawn = at.y[:, None] @ squares @ at.x.swapaxes(1, 2)[:, None]
     shown = at.grid.without_background(drawn.reshape(len(at.seen), 2, -1).astype(np.float32))
     product = shown @ at.seen[..., None]
     explained = product.swapaxes(1, 2) @ np.linalg.solve(shown @ shown.swapaxes(1, 2) + TINY * np.eye(2), product)
@@ -291,7 +304,7 @@ def _explained(at: PatternResiduals, which: IntArray, decoder: Decoder) -> Float
     flat = black.reshape(len(black), -1)
     background = at.grid.background.T.reshape(3, len(at.grid.along), -1)
     shares = np.empty((len(which), len(black)))
-    for row, (seen, x, y) in enumerate(zip(at.seen[which], at.x.value[which], at.y.value[which], strict=True)):
+    for row, (seen, x, y) in enumerate(zip(at.seen[which], at.x[which], at.y[which], strict=True)):
         product = flat @ (y.T @ seen.reshape(background.shape[1:]) @ x).ravel()
         size = ((y.T @ y) @ black @ (x.T @ x)).reshape(len(black), -1)
         size = (size * flat).sum(axis=1) - ((flat @ (y.T @ background @ x).reshape(3, -1).T) ** 2).sum(axis=1)
