@@ -34,6 +34,11 @@ OF_BORDER_PX, OF_BORDERS_TOGETHER = 0.05, 12.0
 #: pixels up to a cell away, is displaced by 0.7 of what the contrast changes in a cell; a slope of the level displaces
 #: nothing.
 OF_UNEVEN_CONTRAST_PX = 0.7
+#: Standard deviation of what the warm surface falls by, from the middle of a marker to its corners, as a share of the
+#: contrast. Where a heater ends 5 cm inside the edge of its sheet, that edge is 6 to 11 % cooler: 1 - 1 / cosh of 5 cm
+#: over sqrt(k t / h), for t = 2 to 1 mm of aluminium, k = 200 W/(m K), h = 20 W/(m2 K) of still air and radiation on
+#: both sides (F. Incropera, D. DeWitt, "Fundamentals of Heat and Mass Transfer", on fins).
+SURFACE_FALLS = 0.1
 #: A side by a gradient of the contrast across it [px^2]: a step with a slope on one side, fitted as a step blurred by
 #: 0.75 px in pixels up to four blurs away, is displaced by 1.4 to 2.0 px^2 times the slope over the step. The slope
 #: looks like contrast too [px]: a step of nothing has 2 px of the slope. Both grow with the distance of the pixels.

@@ -23,7 +23,7 @@ from thermal_fiducial.core.detection.blurred_patterns import (
     PatternResiduals,
     PatternView,
 )
-from thermal_fiducial.core.detection.corner_errors import OF_DISPLAYED_PATTERN_PX, OF_PATTERN_PX
+from thermal_fiducial.core.detection.corner_errors import OF_DISPLAYED_PATTERN_PX, OF_PATTERN_PX, SURFACE_FALLS
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
@@ -59,11 +59,6 @@ _LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.3, (0.5, 2.0)
 # Standard deviation of the blur, in blurs of the optics: the focus. That of the corners from where they are looked for
 # [cells].
 _FOCUS, _START = 0.3, 0.5
-# Standard deviation of what the warm surface falls by, from the middle of a marker to its corners, as a share of the
-# contrast. Where a heater ends 5 cm inside the edge of its sheet, that edge is 6 to 11 % cooler: 1 - 1 / cosh of 5 cm
-# over sqrt(k t / h), for t = 2 to 1 mm of aluminium, k = 200 W/(m K), and h = 20 W/(m2 K) of still air and radiation on
-# both sides (F. Incropera, D. DeWitt, "Fundamentals of Heat and Mass Transfer", on fins).
-_UNEVEN = 0.1
 # Parameters of a fit: corners, blur, contrast, warm surface, background. A fit to something that is not there makes use
 # of fewer, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 it is higher
 # below 8.
@@ -101,7 +96,7 @@ class _Prior(NamedTuple):
         precision = np.zeros(at.J.shape[:2])
         precision[:, :8] = 1.0 / self.corners_std[:, None] ** 2
         precision[:, 8] = 1.0 / (_FOCUS * self.blur_px) ** 2
-        precision[:, 9 + BOWL] = 1.0 / ((_UNEVEN / BOWL_AT_CORNERS * at.contrast) ** 2 + TINY)
+        precision[:, 9 + BOWL] = 1.0 / ((SURFACE_FALLS / BOWL_AT_CORNERS * at.contrast) ** 2 + TINY)
         return precision * _variance_of_samples(at, self.blur_px)[:, None]
 
 

@@ -313,6 +313,28 @@ def test_sides_of_a_large_half_warm_plate_are_measured_near_the_edge():
     assert np.mean(squares) < 2.0
 
 
+@pytest.mark.parametrize(('distance', 'limit'), [(3.0, 0.0006), (5.5, 0.0012)])
+def test_a_heater_that_is_weaker_towards_its_edges_hardly_changes_the_size(distance, limit):
+    """Its contrast falls by a fifth from the middle of a marker to its corners."""
+    camera, rng = Camera(640, 512, K), np.random.default_rng(4)
+    ratios, squares = [], []
+    for _ in range(10):
+        T = marker_pose(distance, (0.0, 0.0, rng.uniform(-0.4, 0.4)), *rng.uniform(-0.1, 0.1, 2))
+        clean, corners = draw(camera, 7, T, 0.3)
+        v, u = np.mgrid[: camera.height, : camera.width]
+        middle, side = corners.mean(axis=0), np.linalg.norm(corners[1] - corners[0])
+        away = np.minimum(((u - middle[0]) ** 2 + (v - middle[1]) ** 2) / side**2, 0.9)
+        image = 7000.0 + (1.0 - 0.4 * away) * (clean - 7000.0) + rng.normal(0.0, 1.25, clean.shape)
+        found = refine(image, corners + rng.uniform(-0.2, 0.2, (4, 2)), camera, 7)
+        error, outward = found.corners_px[0] - corners, corners - middle
+        ratios.append((error * outward).sum() / (outward * outward).sum())
+        squares.append((error[:, None] @ np.linalg.solve(found.covariances[0], error[..., None])).mean() / 2.0)
+    # -0.0004 and -0.0007 when this was written, and -0.0010 and -0.0030 as if it were even.
+    assert abs(np.mean(ratios)) < limit
+    # 1.1 and 1.1, and 2.7 and 4.1 as if it were even.
+    assert np.mean(squares) < 1.8
+
+
 def test_outlines_that_are_no_markers_stay_finite():
     """Quadrilaterals anywhere, most of them of nothing: their corners run away, or fold the outline."""
     rng = np.random.default_rng(0)

@@ -9,7 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corner_errors import GRADIENT_AS_CONTRAST_PX, OF_GRADIENT_PX2, OF_SIDES_PX
+from thermal_fiducial.core.detection.corner_errors import (
+    GRADIENT_AS_CONTRAST_PX,
+    OF_GRADIENT_PX2,
+    OF_SIDES_PX,
+    OF_UNEVEN_CONTRAST_PX,
+)
 from thermal_fiducial.core.detection.corners.sides import ENDS, OPPOSITE, Sides, STARTS
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, SIGMA_OF_MEDIAN, TINY
 
@@ -62,7 +67,12 @@ class Segments(NamedTuple):
     #: variance of a pixel about the model
     noise: FloatArray
 
-    def slope_of_contrast(self) -> FloatArray:
+    def displaced_by_slopes(self) -> FloatArray:
+        """Displacement (N,) of a side by a slope of its contrast across it as large as that along it, rms [px]."""
+        contrast = np.abs(median_of(self.contrast, self.variance < UNMEASURED)[:, 0])
+        return OF_UNEVEN_CONTRAST_PX * self._slope_of_contrast() / np.maximum(contrast, TINY)
+
+    def _slope_of_contrast(self) -> FloatArray:
         """Slope (N,) of the contrast along the sides, rms, as a change from segment to segment.
 
         Over two segments a slope changes it twice as much as over one, noise and the cells behind the sides as much. A

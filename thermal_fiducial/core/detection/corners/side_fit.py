@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, OF_UNEVEN_CONTRAST_PX
+from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, OF_LAG_FORM
 from thermal_fiducial.core.detection.corners.segments import (
     adjust,
     measure,
@@ -17,12 +17,13 @@ from thermal_fiducial.core.detection.corners.segments import (
     UNMEASURED,
     with_gradients,
 )
-from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, ONE_GAUSSIAN, Sides, sides_of
+from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, ONE_GAUSSIAN, reaches, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
+from thermal_fiducial.core.detection.corners.uneven_contrast import freed_of_unevenness
 from thermal_fiducial.core.detection.frame import counts_of, MotionBlur, WITHOUT_TAIL
 from thermal_fiducial.core.detection.refined_corners import RefinedCorners
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, IntArray, TINY
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Columns of pixels per cell for clear markers, and for faint ones.
 OF_CLEAR, OF_FAINT = 6, 12
@@ -72,8 +73,9 @@ def refine_corners(
     modelled = model(sides, behind, blur)
     if uneven.any():
         modelled[2][:] &= _near(sides, blur, uneven)
-    segments, shows = with_gradients(measure(counts, modelled, REACHED * blur.width), sides, widest)
-    refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)))
+    measured, displaced_px = _measured(counts, modelled, sides, blur, _outward(sides, blur, uneven), motion)
+    segments, shows = with_gradients(measured, sides, widest)
+    refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)), displaced_px)
     if shows.any():
         moving, uneven = _again(moving, shows, uneven)
     if passes == 1 or len(moving) == 0:
@@ -84,6 +86,25 @@ def refine_corners(
         uneven[moving],
     )  # fmt: skip
     return refined.with_others(moving, again)
+
+
+def _measured(
+    counts: Float32Array,
+    modelled: tuple[Float32Array, Float32Array, BoolArray],
+    sides: Sides,
+    blur: Blur,
+    outward: FloatArray,
+    motion: MotionBlur,
+) -> tuple[Segments, FloatArray]:
+    """Segments of N markers as if their contrast were even, and what its slope may displace sides by (N,) [px]."""
+    segments = measure(counts, modelled, REACHED * blur.width)
+    displaced_px = segments.displaced_by_slopes()
+    # Where corners have larger errors, those of this correction are not worth it.
+    least = np.hypot(OF_ALL_SIDES_PX, OF_LAG_FORM * np.linalg.norm(motion.spread, axis=1))
+    which = np.flatnonzero(displaced_px > least)
+    if len(which):
+        segments = freed_of_unevenness(segments, which, sides, outward, blur.width)
+    return segments, displaced_px
 
 
 def _again(moving: IntArray, shows: BoolArray, uneven: BoolArray) -> tuple[IntArray, BoolArray]:
@@ -102,7 +123,16 @@ def _near(sides: Sides, blur: Blur, uneven: BoolArray) -> BoolArray:
     return np.asarray(np.abs(sides.distance) <= farthest.astype(np.float32))
 
 
-def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCorners, IntArray]:
+def _outward(sides: Sides, blur: Blur, uneven: BoolArray) -> FloatArray:
+    """Distance (E, m) outside the sides up to which pixels count [px]."""
+    _, outward = reaches(sides, blur.width)
+    farthest = np.where(np.repeat(uneven, 4)[:, None], _WITH_GRADIENT * blur.width, np.inf)
+    return np.asarray(np.minimum(np.minimum(outward, farthest), np.abs(sides.distance[0]).mean(axis=0)))
+
+
+def _moved(
+    sides: Sides, segments: Segments, known: Squared, displaced_px: FloatArray
+) -> tuple[RefinedCorners, IntArray]:
     """Corners after one linearised adjustment, and places (M,) of the markers that have not converged."""
     covariances = known.corner_covariances + OF_ALL_SIDES_PX**2 * _EYE
     # In an outline that is inconsistent with a square, some side belongs to another object.
@@ -118,7 +148,6 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     doubt = np.where(moving, np.maximum(doubt, (shift * shift).max(axis=(1, 2))), doubt)
     corners = sides.ends.reshape(-1, 8, 2).take(_CORNERS, axis=1) + shift
     # More passes would not make corners better that are displaced by their own contrast.
-    uneven = OF_UNEVEN_CONTRAST_PX * segments.slope_of_contrast() / np.maximum(np.abs(contrast), TINY)
-    covariances = covariances + (uneven * uneven)[:, None, None, None] * _EYE
+    covariances = covariances + (displaced_px * displaced_px)[:, None, None, None] * _EYE
     no = np.zeros(len(doubt), dtype=bool)
     return RefinedCorners(corners, covariances, contrast, noise, doubt, no, no, no), np.flatnonzero(moving)

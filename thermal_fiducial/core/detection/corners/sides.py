@@ -242,19 +242,24 @@ def model(sides: Sides, behind: Float32Array, blur: Blur) -> tuple[Float32Array,
     (M, C, E, m) each
     """
     cells = behind.shape[2]
-    cell = sides.across / cells
-    overlapping = cell < _NARROW * blur.width
+    overlapping = sides.across < cells * _NARROW * blur.width
     edges, which = behind.reshape(-1, cells, len(NEIGHBOURS)), np.flatnonzero(overlapping.any(axis=1))
     modelled = _blurred_sides(sides, edges, which, blur)
     value, slope, own = (each[0] if len(each) == 1 else each.mean(axis=0) for each in modelled)
-    reach = np.where(overlapping, cell, cell - 2.0 * blur.width)
-    quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur.width, 0.0))
-    counting: BoolArray = np.asarray(sides.distance >= -quiet.astype(np.float32))
-    counting &= sides.distance <= reach.astype(np.float32)
+    inward, outward = reaches(sides, blur.width)
+    counting: BoolArray = np.asarray(sides.distance >= -outward.astype(np.float32))
+    counting &= sides.distance <= inward.astype(np.float32)
     counting &= sides.fresh & (own > _MOSTLY)
     if sides.inside is not None:
         counting &= sides.inside
     return value, slope, counting
+
+
+def reaches(sides: Sides, width: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distances (E, m) inside and outside the sides up to which pixels count, for blur of ``width`` (E, m) [px]."""
+    cell = sides.across / sides.across.shape[1]
+    inward = np.where(cell < _NARROW * width, cell, cell - 2.0 * width)
+    return inward, np.minimum(inward, np.maximum(cell - _PLATE_EDGE_SHOWS * width, 0.0))
 
 
 def _blurred_sides(
