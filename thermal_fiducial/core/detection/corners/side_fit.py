@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, OF_LAG_FORM
+from thermal_fiducial.core.detection.corners.reach import ending_sides, Reach
 from thermal_fiducial.core.detection.corners.segments import (
     adjust,
     measure,
@@ -17,7 +18,7 @@ from thermal_fiducial.core.detection.corners.segments import (
     UNMEASURED,
     with_gradients,
 )
-from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, ONE_GAUSSIAN, reaches, Sides, sides_of
+from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, ONE_GAUSSIAN, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.corners.uneven_contrast import freed_of_unevenness
 from thermal_fiducial.core.detection.frame import counts_of, MotionBlur, WITHOUT_TAIL
@@ -30,9 +31,6 @@ OF_CLEAR, OF_FAINT = 6, 12
 _EYE = np.eye(2)
 # Indices of the corners, clockwise, among the ends of the sides.
 _CORNERS = np.array([0, 1, 3, 2])
-# Distance from the sides [blurs] beyond which pixels do not count where a gradient of temperature displaces a side: it
-# displaces it by as much less as pixels are nearer, and noise by a tenth more.
-_WITH_GRADIENT = 4.0
 # Largest number of passes. A corner has converged when its last step is below _UNSURE of its standard deviations,
 # clipped to the limits _SETTLED_PX [px].
 _PASSES = 4
@@ -48,7 +46,7 @@ def refine_corners(
     columns: int = OF_CLEAR,
     motion: MotionBlur | None = None,
     passes: int = _PASSES,
-    uneven: BoolArray | None = None,
+    reach: Reach | None = None,
 ) -> RefinedCorners:
     """Corners of N markers; those that have not converged are refined again, in so many passes at most.
 
@@ -60,31 +58,34 @@ def refine_corners(
     blur_px : standard deviation of optics and pixel
     columns : of pixels, in a segment
     motion : blur by motion; none when left out
-    uneven : (N,) whether a gradient of temperature displaces a side; so far of none when left out
+    reach : which pixels count; all that the cells allow when left out
     """
-    motion = motion or MotionBlur.none(len(corners.px))
-    uneven = np.zeros(len(corners.px), dtype=bool) if uneven is None else uneven
+    motion, reach = motion or MotionBlur.none(len(corners.px)), reach or Reach.everywhere(len(corners.px))
     # Where lag tails stay, the blur is so small that it hardly differs from one Gaussian.
     parts = ONE_GAUSSIAN if motion.to_tails is None else WITHOUT_TAIL
-    widest = math.hypot(blur_px, math.sqrt(float((motion.spread * motion.spread).sum(axis=1).max())))
+    widest = math.hypot(blur_px, float(np.hypot(*motion.spread.T).max()))
     sides = sides_of(corners.x, camera, image.shape, behind.shape[2], columns, widest)
     blur = blur_of(sides, blur_px, motion.spread, parts)
     counts = counts_of(sides.pixel, image, motion.to_tails)
     modelled = model(sides, behind, blur)
-    if uneven.any():
-        modelled[2][:] &= _near(sides, blur, uneven)
-    measured, displaced_px = _measured(counts, modelled, sides, blur, _outward(sides, blur, uneven), motion)
+    reach.bound(modelled[2], sides)
+    outward = reach.outward(sides, blur.width)
+    measured, displaced_px = _measured(counts, modelled, sides, blur, outward, motion)
     segments, shows = with_gradients(measured, sides, widest)
     refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)), displaced_px)
-    if shows.any():
-        moving, uneven = _again(moving, shows, uneven)
+    ending = ending_sides(counts, modelled, sides, measured, outward, blur.width, np.hypot(*motion.spread.T))
+    # From farther off near pixels pull towards another edge, and another edge ends the surface.
+    shows[moving] = False
+    ending &= (np.abs(refined.corners_px - corners.px).max(axis=(1, 2)) < _SETTLED_PX[1])[:, None]
+    fewer = np.flatnonzero((shows & ~reach.near) | ending.any(axis=1))
+    if len(fewer):
+        moving, reach = np.union1d(moving, fewer), reach.nearer(shows, ending, sides, blur)
     if passes == 1 or len(moving) == 0:
         return refined
     start = corners.only(moving).at_pixels(refined.corners_px[moving])
     again = refine_corners(
-        image, start, camera, behind[moving], blur_px, columns, motion.only(moving), passes - 1,
-        uneven[moving],
-    )  # fmt: skip
+        image, start, camera, behind[moving], blur_px, columns, motion.only(moving), passes - 1, reach.only(moving)
+    )
     return refined.with_others(moving, again)
 
 
@@ -99,35 +100,13 @@ def _measured(
     """Segments of N markers as if their contrast were even, and what its slope may displace sides by (N,) [px]."""
     segments = measure(counts, modelled, REACHED * blur.width)
     displaced_px = segments.displaced_by_slopes()
-    # Where corners have larger errors, those of this correction are not worth it.
-    least = np.hypot(OF_ALL_SIDES_PX, OF_LAG_FORM * np.linalg.norm(motion.spread, axis=1))
-    which = np.flatnonzero(displaced_px > least)
+    # Where sides have larger errors anyway, the correction is not worth its own.
+    noise = np.median(segments.variance, axis=1) / sides.across.shape[1]
+    form = OF_LAG_FORM**2 * (motion.spread * motion.spread).sum(axis=1)
+    which = np.flatnonzero(displaced_px > np.sqrt(OF_ALL_SIDES_PX**2 + form + noise))
     if len(which):
         segments = freed_of_unevenness(segments, which, sides, outward, blur.width)
     return segments, displaced_px
-
-
-def _again(moving: IntArray, shows: BoolArray, uneven: BoolArray) -> tuple[IntArray, BoolArray]:
-    """Places (M,) of the markers to refine again, and which (N,) of all by near pixels.
-
-    Only those that have converged with all pixels: from farther off near pixels pull towards another edge.
-    """
-    displaced = shows & ~uneven
-    displaced[moving] = False
-    return np.union1d(moving, np.flatnonzero(displaced)), uneven | displaced
-
-
-def _near(sides: Sides, blur: Blur, uneven: BoolArray) -> BoolArray:
-    """Which pixels (M, C, E, m) count: all, or those near the sides where markers (N,) are ``uneven``."""
-    farthest = np.repeat(np.where(uneven, _WITH_GRADIENT, np.inf), 4)[:, None] * blur.width
-    return np.asarray(np.abs(sides.distance) <= farthest.astype(np.float32))
-
-
-def _outward(sides: Sides, blur: Blur, uneven: BoolArray) -> FloatArray:
-    """Distance (E, m) outside the sides up to which pixels count [px]."""
-    _, outward = reaches(sides, blur.width)
-    farthest = np.where(np.repeat(uneven, 4)[:, None], _WITH_GRADIENT * blur.width, np.inf)
-    return np.asarray(np.minimum(np.minimum(outward, farthest), np.abs(sides.distance[0]).mean(axis=0)))
 
 
 def _moved(

@@ -13,7 +13,7 @@ import numpy as np
 from thermal_fiducial.core.detection.corner_errors import SURFACE_FALLS
 from thermal_fiducial.core.detection.corners.segments import median_of, Segments, UNMEASURED
 from thermal_fiducial.core.detection.corners.sides import Sides
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 # Displacement of a blurred step with a slope on one side of it, fitted as a step, over the product of its blur, the
 # distance up to which pixels count, and the slope over the contrast: 0.80 to 0.87 for a blur of 0.5 to 0.9 px and
@@ -34,25 +34,30 @@ _SCATTER = 1e-6
 
 
 class _Perimeter(NamedTuple):
-    """The S segments along the sides of a marker, in shares of its sides from its middle."""
+    """The S segments along the sides of a marker, and a quadratic function of the place there, over its sides."""
 
-    #: (S, 2) middles of the segments, and normals outward
-    places: FloatArray
-    outward: FloatArray
-    #: (S,) whether the ends of the sides are not in it
+    #: (S, 6) its terms: level, slopes, curvatures, change around the marker
+    terms: FloatArray
+    #: (2, S), (2, S) slopes inward of the linear terms and of the quadratic ones
+    of_linear: FloatArray
+    of_quadratic: FloatArray
+    #: (S,) whether segments are not at the ends of their sides, and (S, S) what a fit to these leaves of values there
     inner: BoolArray
+    left: FloatArray
 
 
 @cache
 def _perimeter(cells: int) -> _Perimeter:
-    along, end, none = (np.arange(cells) + 0.5) / cells - 0.5, np.full(cells, 0.5), np.zeros(cells)
+    along, end = (np.arange(cells) + 0.5) / cells - 0.5, np.full(cells, 0.5)
     x, y = np.concatenate([along, along, -end, end]), np.concatenate([-end, end, along, along])
-    out_x, out_y = (
-        np.concatenate([none, none, -2.0 * end, 2.0 * end]),
-        np.concatenate([-2.0 * end, 2.0 * end, none, none]),
-    )
+    across_x = np.repeat([False, False, True, True], cells)
+    outward = np.sign(np.stack([np.where(across_x, x, 0.0), np.where(across_x, 0.0, y)]))
+    turning = outward[0] * y - outward[1] * x
+    terms = np.stack([np.ones_like(x), x, y, x * x, y * y, turning], axis=-1)
     inner = np.tile(np.abs(along) < 0.5 - 1.0 / cells, 4)
-    return _Perimeter(np.stack([x, y], axis=-1), np.stack([out_x, out_y], axis=-1), inner)
+    left = np.zeros((len(x), len(x)))
+    left[np.ix_(inner, inner)] = np.eye(inner.sum()) - terms[inner] @ np.linalg.pinv(terms[inner])
+    return _Perimeter(terms, -outward, -2.0 * outward * np.stack([x, y]), inner, left)
 
 
 def freed_of_unevenness(
@@ -83,18 +88,16 @@ def _quadratic(contrast: FloatArray, used: BoolArray, away: FloatArray, cells: i
     ``away`` (N, S): distance of the places from the sides, outward [sides].
     """
     around = _perimeter(cells)
-    x, y = np.moveaxis(around.places + away[..., None] * around.outward, -1, 0)
-    turning = np.broadcast_to((around.places * around.outward[:, ::-1] * [-1.0, 1.0]).sum(axis=1), x.shape)
-    X = np.stack([np.ones_like(x), x, y, x * x, y * y, turning], axis=-1)
     good = used & around.inner & (np.abs(contrast - 1.0) < _ODD)
-    weighted = (X * good[..., None]).swapaxes(1, 2)
-    seen, product = weighted @ X, weighted @ contrast[..., None]
     number = good.sum(axis=1)
-    # First for the scatter about it: what noise and the cells behind the sides make of contrasts.
-    left = (contrast - (X @ np.linalg.solve(seen + TINY * np.eye(X.shape[2]), product))[..., 0]) * good
-    scatter = np.maximum((left * left).sum(axis=1) / np.maximum(number - X.shape[2], 1), _SCATTER)[:, None, None]
-    amounts = np.linalg.solve(seen + scatter * np.diag(_BEFORE**-2), product)[..., 0]
+    # What noise and the cells behind the sides make of contrasts.
+    left = np.where(good, contrast, 1.0) @ around.left
+    free = np.maximum(number - around.terms.shape[1], 1)
+    scatter = np.maximum((left * left * good).sum(axis=1) / free, _SCATTER)
+    weighted = around.terms.T * (good / scatter[:, None])[:, None]
+    amounts = np.linalg.solve(weighted @ around.terms + np.diag(_BEFORE**-2), weighted @ contrast[..., None])[..., 0]
     amounts[number < _FEWEST, 1:] = 0.0
-    _, by_x, by_y, by_xx, by_yy, _ = amounts.T[..., None]
-    inward = -np.stack([by_x + 2.0 * by_xx * x, by_y + 2.0 * by_yy * y], axis=-1) * around.outward
-    return (X @ amounts[..., None])[..., 0], inward.sum(axis=-1)
+    # Farther out are steeper slopes of a curvature, and larger differences by a slope.
+    farther = 1.0 + 2.0 * away
+    slope = amounts[:, 1:3] @ around.of_linear / farther + amounts[:, 3:5] @ around.of_quadratic * farther
+    return amounts @ around.terms.T, slope
