@@ -45,6 +45,8 @@ def run(args: argparse.Namespace) -> int:
 
     started = time.monotonic()
     flight = plan(SCENARIO, args.seconds, args.seed)
+    # Refuses what cannot be flown, before an earlier demo is removed for it.
+    flight.scenario.trajectory(flight.seconds, flight.seed)
     _make_room(args.out)
     bag = args.out / BAG
     _simulate(bag, flight)

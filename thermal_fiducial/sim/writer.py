@@ -1,11 +1,13 @@
 """A simulated flight as a rosbag2, with all files that its replay needs."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, fields
 import heapq
 import multiprocessing
+from multiprocessing.connection import Connection
 import os
 from pathlib import Path
 import shutil
@@ -113,9 +115,10 @@ def write_flight(
 
 def _write_bag(folder: Path, flight: FlightPlan, storage: str, workers: int, progress: Callable[[int], None]) -> None:
     corners = ['stamp_ns,id,u0,v0,u1,v1,u2,v2,u3,v3\n']
-    frames = _noting_corners(_frames(flight, workers), corners)
-    events = heapq.merge(_body_events(flight), _camera_events(frames, flight), key=lambda event: event.arrival_ns)
-    with BagWriter(folder, storage) as bag:
+    # Closed after an error too, and not by the garbage collector, which may do so in any thread.
+    with closing(_frames(flight, workers)) as rendered, BagWriter(folder, storage) as bag:
+        frames = _noting_corners(rendered, corners)
+        events = heapq.merge(_body_events(flight), _camera_events(frames, flight), key=lambda event: event.arrival_ns)
         for event in events:
             bag.write(event.topic, event.arrival_ns, event.message)
             if event.topic == IMAGE_TOPIC:
@@ -173,17 +176,25 @@ def _arrivals(record: ImuRecord, stamps: IntArray, scenario: Scenario) -> list[i
 _worker_camera: list[ThermalCamera] = []
 
 
-def _start_worker(flight: FlightPlan) -> None:
+def _start_worker(flight: FlightPlan, lifeline: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process ends us
+    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
     cv2.setNumThreads(1)
     _worker_camera[:] = [ThermalCamera(flight)]
+
+
+def _end_with(lifeline: Connection) -> None:
+    """End this worker when the parent closes ``lifeline`` or has ended, be it by a second interrupt or by a kill."""
+    with suppress(EOFError, OSError):
+        lifeline.recv()
+    os._exit(1)
 
 
 def _render_chunk(start: int, stop: int) -> list[SimFrame]:
     return list(_worker_camera[0].frames(start, stop))
 
 
-def _frames(flight: FlightPlan, workers: int) -> Iterator[SimFrame]:
+def _frames(flight: FlightPlan, workers: int) -> Generator[SimFrame, None, None]:
     if workers <= 1:
         yield from ThermalCamera(flight).frames(0, flight.frame_count)
         return
@@ -191,12 +202,14 @@ def _frames(flight: FlightPlan, workers: int) -> Iterator[SimFrame]:
     stops = [min(start + CHUNK, flight.frame_count) for start in starts]
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')  # a worker is to use one core
     context = multiprocessing.get_context('spawn')  # a fork of a process that runs ROS deadlocks
-    with ProcessPoolExecutor(min(workers, len(starts)), context, _start_worker, (flight,)) as pool:
+    lifeline, theirs = context.Pipe()
+    # Left in the reverse order: the workers have ended before the pool waits for them, also with an error.
+    with ProcessPoolExecutor(min(workers, len(starts)), context, _start_worker, (flight, theirs)) as pool, lifeline:
         with _interrupts_ignored():
             # Its children inherit this: an interrupt may reach them before their first line.
-            chunks = pool.map(_render_chunk, starts, stops)
-        for chunk in chunks:
-            yield from chunk
+            chunks = deque(pool.submit(_render_chunk, *span) for span in zip(starts, stops, strict=True))
+        while chunks:
+            yield from chunks.popleft().result()
 
 
 @contextmanager

@@ -149,9 +149,19 @@ def test_output_that_takes_nothing_or_not_every_letter(tmp_path, output, encodin
     assert (done.returncode, done.stderr) == expected
 
 
+def test_a_demo_that_cannot_be_flown_leaves_the_earlier_one(tmp_path, capsys):
+    (tmp_path / '.thermal_fiducial_demo').touch()
+    (tmp_path / 'report.html').touch()
+    assert main(['demo', '--out', str(tmp_path), '--seconds', '3']) == 2
+    says = 'thermal-fiducial demo: 3 s is too short for take-off and landing: at least 11 s\n'
+    assert capsys.readouterr().err == says
+    assert (tmp_path / 'report.html').exists()
+
+
 @pytest.mark.nightly
-def test_an_interrupt_of_simulate_is_one_line_and_leaves_nothing(tmp_path):
-    """While its workers still import what they need."""
+@pytest.mark.parametrize(('after_s', 'again'), [(0.3, False), (0.3, True), (6.0, True)])
+def test_an_interrupt_of_simulate_is_one_line_and_leaves_nothing(tmp_path, after_s, again):
+    """While its workers still import what they need, and while they render; a second one comes while Python ends."""
     # A shell's background jobs ignore the signal, and so would what they start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(
@@ -162,10 +172,16 @@ def test_an_interrupt_of_simulate_is_one_line_and_leaves_nothing(tmp_path):
     )
     while process.poll() is None and not children(process.pid):
         time.sleep(0.05)
-    time.sleep(0.3)
+    time.sleep(after_s)
     os.killpg(process.pid, signal.SIGINT)
+    if again:
+        time.sleep(0.2)
+        os.killpg(process.pid, signal.SIGINT)
+    # Workers that stay would hold the pipe.
     error = process.communicate(timeout=60)[1]
-    assert (process.returncode, error.splitlines()[-1]) == (130, 'thermal-fiducial simulate: interrupted')
+    # For a shell both are 130.
+    assert process.returncode == 130 or (again and process.returncode == -signal.SIGINT)
+    assert error.splitlines()[-1] == 'thermal-fiducial simulate: interrupted'
     assert 'Traceback' not in error
     assert not (tmp_path / 'bag').exists()
 
