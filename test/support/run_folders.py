@@ -15,11 +15,17 @@ from thermal_fiducial.files.bags import TRUTH_TOPIC
 from thermal_fiducial.files.innovations import innovations_text
 from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.files.trajectory_file import save_tum
+from thermal_fiducial.report.output_bag import RecordedOutput
+from thermal_fiducial.report.run_folder import Detections, Run
+from thermal_fiducial.report.trajectory import Trajectory
 
 START_NS = 1_700_000_000_000_000_000
 FUSED_SIGMA = np.array([2e-3, 2e-3, 2e-3, 3e-4, 3e-4, 3e-4])
 FIDUCIAL_SIGMA = 5.0 * FUSED_SIGMA
 FUSED_DELAY_NS, CAMERA_DELAY_NS = 1_000_000, 25_000_000
+#: Length of trajectories.
+SECONDS = 12.0
+NOTHING = Detections(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 2)), np.zeros(0))
 
 
 def true_pose(t):
@@ -27,6 +33,18 @@ def true_pose(t):
     p = np.stack([0.8 * np.sin(0.5 * t), 1.2 * np.sin(0.25 * t), 1.2 + 0.3 * np.cos(0.4 * t)], axis=-1)
     phi = np.stack([0.06 * np.sin(1.1 * t), 0.05 * np.cos(0.9 * t), 0.4 * np.sin(0.3 * t)], axis=-1)
     return transform(so3_exp(phi), p)
+
+
+def trajectory(rate_hz, seconds=SECONDS):
+    """The true poses at a rate."""
+    stamps = START_NS + np.arange(0, round(seconds * 1e9), round(1e9 / rate_hz))
+    return Trajectory(stamps, true_pose((stamps - START_NS) * 1e-9))
+
+
+def run_of(tmp_path, fused, fiducial, **more):
+    """A run of two trajectories, as if read from the folder."""
+    empty = {'latencies': {}, 'output': RecordedOutput(), 'marker_map': None, 'summary': {}, 'truth': trajectory(100.0)}
+    return Run(tmp_path, fused, fiducial, **({'detections': NOTHING} | empty | more))
 
 
 def disturbed(T, sigma, rng):

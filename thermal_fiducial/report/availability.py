@@ -13,7 +13,7 @@ import numpy as np
 from thermal_fiducial.core.geometry.se3 import so3_log
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.report import metrics
-from thermal_fiducial.report.interruptions import GAP_NS
+from thermal_fiducial.report.interruptions import GAP_NS, ONE_CLOCK_NS
 from thermal_fiducial.report.output_bag import Arrivals
 from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.trajectory import Trajectory
@@ -21,8 +21,6 @@ from thermal_fiducial.report.trajectory import Trajectory
 #: Interval of the instants [ns], incommensurate with the rates of the poses; largest number of instants.
 STEP_NS = 1_730_000
 MOST_INSTANTS = 200_000
-#: Largest difference of stamp and arrival on one clock [ns].
-_ONE_CLOCK_NS = 500_000_000
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ def at_frames(run: Run) -> dict[str, dict[str, float]] | None:
 def _clock_shift_ns(fused: Arrivals) -> int:
     """Offset to subtract from arrival times if their clock differs from that of the stamps; else 0."""
     least = int(np.min(fused.times_ns - fused.stamps_ns))
-    return least if not 0 <= least < _ONE_CLOCK_NS else 0
+    return least if not 0 <= least < ONE_CLOCK_NS else 0
 
 
 def _times_of(trajectory: Trajectory, arrivals: Arrivals, shift_ns: int) -> IntArray:

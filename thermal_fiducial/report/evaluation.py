@@ -10,7 +10,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.report import metrics
 from thermal_fiducial.report.availability import at_frames, Available, available
-from thermal_fiducial.report.interruptions import Interruption, interruptions
+from thermal_fiducial.report.interruptions import Interruption, interruptions, run_span
 from thermal_fiducial.report.map_error import map_accuracy
 from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.tags import Tag, tags
@@ -40,14 +40,10 @@ class Evaluation:
 
     @property
     def start_ns(self) -> int:
-        """First stamp of all data: zero of the plots' time."""
-        run = self.run
-        firsts = [
-            stamps[0]
-            for stamps in (run.fiducial.stamps_ns, run.fused.stamps_ns, run.detections.stamps_ns)
-            if len(stamps)
-        ]
-        return int(min(firsts, default=0))
+        """First stamp of the run: zero of the plots' time."""
+        first, _ = run_span(self.run)
+        detections = self.run.detections.stamps_ns
+        return min(first, int(detections[0])) if len(detections) and first else first
 
     def seconds(self, stamps_ns: IntArray) -> FloatArray:
         """Time of the plots [s]."""
@@ -78,7 +74,7 @@ class Evaluation:
     def numbers(self) -> dict[str, Any]:
         """All measures; unknown ones are left out."""
         result: dict[str, Any] = {
-            'fused': metrics.output(self.run.fused),
+            'fused': metrics.output(self.run.fused) | self._silence(),
             'fiducial': {'poses': len(self.run.fiducial), 'path_length_m': metrics.path_length(self.run.fiducial)},
             'markers': self._markers(),
             'interruptions': [_interruption_numbers(entry) for entry in self.interruptions],
@@ -101,6 +97,11 @@ class Evaluation:
         if len(self.run.output.innovations.nis):
             result['innovations'] = metrics.innovation_consistency(self.run.output.innovations)
         return result
+
+    def _silence(self) -> dict[str, float]:
+        """Time without a pose at the end of the run [ms]; a filter that is lost gives none."""
+        fused, (_, last) = self.run.fused.stamps_ns, run_span(self.run)
+        return {'silent_at_end_ms': (last - int(fused[-1])) / 1e6} if len(fused) else {}
 
     def _comparable_maps(self) -> tuple[MarkerMap, MarkerMap] | None:
         """Map of the run and the true one; None without either, or without a common marker (no pose ever went out)."""
@@ -140,6 +141,7 @@ def _interruption_numbers(entry: Interruption) -> dict[str, Any]:
         'step_mm': entry.step_mm,
         'error_mm': entry.error_mm,
         'error_deg': entry.error_deg,
+        'before_start': entry.before_start,
     }
     return {name: value for name, value in numbers.items() if value is not None}
 

@@ -9,12 +9,13 @@ from thermal_fiducial.core.imaging.frame_cleaner import SHUTTER
 from thermal_fiducial.core.types import BoolArray, IntArray, SECOND_NS
 from thermal_fiducial.report.metrics import Errors, FRAME_NS, steps
 from thermal_fiducial.report.run_folder import Run
-from thermal_fiducial.report.trajectory import Trajectory
 
 #: Gap between poses from markers above which it is an interruption [ns].
 GAP_NS = 300_000_000
 #: Camera periods without a frame above which frames are missing, not just late: the shutter drops several.
 _HOLE_PERIODS = 2.5
+#: Largest difference of a stamp and its recording on one clock [ns].
+ONE_CLOCK_NS = 500_000_000
 
 
 class Cause(Enum):
@@ -36,11 +37,13 @@ class Interruption:
     cause: Cause
     #: number of fused poses during it
     fused_poses: int
-    #: step of the fused position at its end, when markers are seen again [mm]
-    step_mm: float
+    #: step of the fused position at its end, when markers are seen again [mm]; None without either
+    step_mm: float | None
     #: errors at its end [mm, deg]; None without truth
     error_mm: float | None = None
     error_deg: float | None = None
+    #: whether the filter had not started when it began: nothing was coasted
+    before_start: bool = False
 
     @property
     def seconds(self) -> float:
@@ -54,12 +57,30 @@ class Interruption:
 
 
 def interruptions(run: Run, fused_errors: Errors | None) -> list[Interruption]:
-    """Gaps of the poses from markers above :data:`GAP_NS`, and shorter ones caused by the shutter."""
-    stamps = run.fiducial.stamps_ns
+    """Gaps of the poses from markers above :data:`GAP_NS`, and shorter ones caused by the shutter.
+
+    The time before the first pose and that after the last one count too.
+    """
+    first, last = run_span(run)
+    stamps = np.concatenate([[first], run.fiducial.stamps_ns, [last]])
     ends = np.flatnonzero(np.diff(stamps) > GAP_NS)
     spans = [(int(stamps[i]), int(stamps[i + 1])) for i in ends]
     spans += [hole for hole in _shutter_holes(run) if not any(a < hole[1] and hole[0] < b for a, b in spans)]
-    return [_described(run, start, end, fused_errors) for start, end in sorted(spans) if len(run.fused)]
+    return [_described(run, start, end, fused_errors) for start, end in sorted(spans)]
+
+
+def run_span(run: Run) -> tuple[int, int]:
+    """First and last stamp of a run: of its data, and of the bag if that was recorded by the clock of the stamps."""
+    known = [stamps for stamps in (run.fused.stamps_ns, run.fiducial.stamps_ns, run.output.frames_ns) if len(stamps)]
+    if not known:
+        return 0, 0
+    first, last = min(int(stamps[0]) for stamps in known), max(int(stamps[-1]) for stamps in known)
+    if 'start_ns' not in run.summary or 'duration_s' not in run.summary:
+        return first, last
+    start = int(run.summary['start_ns'])
+    end = start + round(run.summary['duration_s'] * SECOND_NS)
+    of_one_clock = start - ONE_CLOCK_NS < first and last < end + ONE_CLOCK_NS
+    return (min(start, first), max(end, last)) if of_one_clock else (first, last)
 
 
 def frame_holes(frames_ns: IntArray) -> list[tuple[int, int]]:
@@ -109,15 +130,17 @@ def _described(run: Run, start_ns: int, end_ns: int, e: Errors | None) -> Interr
         end_ns=end_ns,
         cause=_cause(run, start_ns, end_ns),
         fused_poses=int(inside.sum()),
-        step_mm=_step_mm(fused, inside, end_ns),
+        before_start=not np.any(fused.stamps_ns <= start_ns),
+        step_mm=_step_mm(run, inside, end_ns),
         error_mm=error_mm,
         error_deg=error_deg,
     )
 
 
-def _step_mm(fused: Trajectory, inside: BoolArray, end_ns: int) -> float:
-    if not inside.any():
-        return 0.0
+def _step_mm(run: Run, inside: BoolArray, end_ns: int) -> float | None:
+    fused = run.fused
+    if not inside.any() or not np.any(run.fiducial.stamps_ns >= end_ns):
+        return None
     # The frame that ends the interruption corrects the filter after its processing, tens of milliseconds later.
     after = (fused.stamps_ns > end_ns) & (fused.stamps_ns <= end_ns + 3 * FRAME_NS)
     last = fused.stamps_ns == fused.stamps_ns[inside][-1]

@@ -97,8 +97,10 @@ def _shutter(evaluation: Evaluation) -> Card | None:
     return Card('Shutter (FFC)', str(len(events)), unit, f'the longest {longest:.2f} s')
 
 
-def _drop_outs(evaluation: Evaluation) -> Card:
-    others = [entry for entry in evaluation.interruptions if not entry.is_shutter]
+def _drop_outs(evaluation: Evaluation) -> Card | None:
+    if not len(evaluation.run.fiducial):
+        return None
+    others = [entry for entry in evaluation.interruptions if not (entry.is_shutter or entry.before_start)]
     if not others:
         return Card('Drop-outs', '0', '', 'no other time over 0.3 s without markers')
     longest = max(entry.seconds for entry in others)

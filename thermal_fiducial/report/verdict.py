@@ -68,7 +68,7 @@ def judge(evaluation: Evaluation, numbers: dict[str, Any]) -> RunVerdict:
     """The verdict on a run; ``numbers`` are :meth:`Evaluation.numbers`."""
     made = [
         _output(numbers),
-        _error(numbers),
+        _error(evaluation, numbers),
         _consistency(numbers),
         _refused(numbers),
         _steps(numbers),
@@ -85,7 +85,10 @@ def _output(numbers: dict[str, Any]) -> Remark:
     fused = numbers['fused']
     if fused['poses'] < 3:
         return Remark(Weight.FAULT, 'The filter gave no pose.')
+    silence = fused.get('silent_at_end_ms', 0.0)
     pause, rate = fused['longest_pause_ms'], f'{fused["rate_hz"]:.0f} poses a second'
+    if silence > max(pause, LONG_PAUSE_MS):
+        return Remark(Weight.FAULT, f'{rate}, but none in the last {silence / 1e3:.1f} s.')
     if pause > LONG_PAUSE_MS:
         return Remark(Weight.FAULT, f'{rate}, but none for {pause:.0f} ms at the longest.')
     if pause > SHORT_PAUSE_MS:
@@ -93,10 +96,12 @@ def _output(numbers: dict[str, Any]) -> Remark:
     return Remark(Weight.GOOD, f'{rate}, without a pause.')
 
 
-def _error(numbers: dict[str, Any]) -> Remark | None:
+def _error(evaluation: Evaluation, numbers: dict[str, Any]) -> Remark | None:
     error = numbers['fused'].get('error')
-    if error is None:
+    if evaluation.run.truth is None:
         return Remark(Weight.NOTE, 'No ground truth: how large the errors are is not known.')
+    if error is None:
+        return None
     return Remark(
         Weight.GOOD,
         f'Errors against ground truth: {error["position_rms_mm"]:.1f} mm and {error["attitude_rms_deg"]:.2f} deg rms, '
@@ -136,17 +141,21 @@ def _steps(numbers: dict[str, Any]) -> Remark | None:
 
 def _interruptions(evaluation: Evaluation) -> list[Remark]:
     shutter = [entry for entry in evaluation.interruptions if entry.is_shutter]
-    others = [entry for entry in evaluation.interruptions if not entry.is_shutter]
+    others = [entry for entry in evaluation.interruptions if not (entry.is_shutter or entry.before_start)]
+    late = [entry for entry in evaluation.interruptions if entry.before_start]
     remarks = []
     if shutter:
         longest = max(entry.seconds for entry in shutter)
         remarks.append(Remark(Weight.GOOD, f'{_times(len(shutter), "shutter event")}, the longest {longest:.1f} s.'))
+    if late:
+        when = f'in the first {late[0].seconds:.1f} s' if len(evaluation.run.fiducial) else 'in the whole run'
+        remarks.append(Remark(Weight.NOTE, f'No pose from the markers {when} ({late[0].cause.value}).'))
     if others:
         longest = max(entry.seconds for entry in others)
         weight = Weight.DOUBT if longest > LONG_COAST_S else Weight.NOTE
         causes = ', '.join(sorted({entry.cause.value for entry in others}))
         remarks.append(Remark(weight, f'{_times(len(others), "drop-out")} of up to {longest:.1f} s ({causes}).'))
-    else:
+    elif len(evaluation.run.fiducial):
         remarks.append(Remark(Weight.GOOD, 'No drop-out of the markers.'))
     return remarks
 

@@ -120,7 +120,7 @@ def test_a_run_in_which_nothing_came_out_has_a_report(tmp_path):
     (tmp_path / 'detections.csv').write_text('stamp_ns,id,u0,v0,u1,v1,u2,v2,u3,v3,sigma_px\n')
     evaluation, numbers = evaluate_run(tmp_path)
     assert numbers['fused'] == {'poses': 0}
-    assert [card.name for card in cards(evaluation, numbers)] == ['Output', 'Markers', 'Drop-outs']
+    assert [card.name for card in cards(evaluation, numbers)] == ['Output', 'Markers']
     assert write_report(tmp_path).is_file()
 
 

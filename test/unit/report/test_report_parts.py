@@ -1,11 +1,20 @@
-"""Parts of the report: interruptions, what a controller has, errors of the map, markers one by one, the verdict."""
+"""Parts of the report: what a controller has, errors of the map, markers one by one, the verdict."""
 
 from dataclasses import replace
 import re
 
 import numpy as np
 import pytest
-from support.run_folders import CAMERA_DELAY_NS, FUSED_DELAY_NS, make_run, START_NS, true_pose, wall
+from support.run_folders import (
+    CAMERA_DELAY_NS,
+    FUSED_DELAY_NS,
+    make_run,
+    run_of,
+    SECONDS,
+    START_NS,
+    trajectory,
+    wall,
+)
 
 from thermal_fiducial.cli.evaluate import print_tables
 from thermal_fiducial.cli.main import main
@@ -13,31 +22,16 @@ from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import save_map
-from thermal_fiducial.report import interruptions as breaks
 from thermal_fiducial.report.availability import at_frames, available
 from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.map_error import map_accuracy, marker_errors
-from thermal_fiducial.report.metrics import errors
 from thermal_fiducial.report.output_bag import Arrivals, RecordedOutput
-from thermal_fiducial.report.run_folder import Detections, read_run, Run
+from thermal_fiducial.report.run_folder import read_run
 from thermal_fiducial.report.tables import Table
 from thermal_fiducial.report.tags import tags
 from thermal_fiducial.report.time_plots import TimePlots
 from thermal_fiducial.report.trajectory import Trajectory
 from thermal_fiducial.report.verdict import HEADLINES, judge, Weight
-
-SECONDS = 12.0
-NOTHING = Detections(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 2)), np.zeros(0))
-
-
-def trajectory(rate_hz, seconds=SECONDS):
-    stamps = START_NS + np.arange(0, round(seconds * 1e9), round(1e9 / rate_hz))
-    return Trajectory(stamps, true_pose((stamps - START_NS) * 1e-9))
-
-
-def run_of(tmp_path, fused, fiducial, **more):
-    empty = {'latencies': {}, 'output': RecordedOutput(), 'marker_map': None, 'summary': {}, 'truth': trajectory(100.0)}
-    return Run(tmp_path, fused, fiducial, **({'detections': NOTHING} | empty | more))
 
 
 def test_logarithmic_axes_have_whole_numbers_at_their_ticks():
@@ -51,56 +45,6 @@ def test_logarithmic_axes_have_whole_numbers_at_their_ticks():
     assert shown[1] == ('0.01', '0.03', '0.1', '0.3', '1', '3', '10', '30', '100', '300')
     assert shown[2][:3] == ('0.001', '0.01', '0.1')
     assert shown[3] is None
-
-
-# --- interruptions -----------------------------------------------------------------------------------
-
-
-def test_an_interruption_with_its_error_and_the_step_at_its_end(tmp_path):
-    fused, fiducial = trajectory(200.0), trajectory(30.0)
-    seconds = (fiducial.stamps_ns - START_NS) * 1e-9
-    fiducial = fiducial.take((seconds < 8.0) | (seconds > 10.0))
-    t = (fused.stamps_ns - START_NS) * 1e-9
-    wandering = fused.T_map_body.copy()
-    wandering[:, 1, 3] += np.where((t > 8.0) & (t < 10.0334), 0.02 * (t - 8.0), 0.0)
-    run = run_of(tmp_path, Trajectory(fused.stamps_ns, wandering), fiducial)
-    (entry,) = breaks.interruptions(run, errors(run.fused, run.truth))
-    assert entry.seconds == pytest.approx(2.03, abs=0.04)
-    assert entry.fused_poses == pytest.approx(200 * entry.seconds, abs=1)
-    # 2 cm/s for 2 s; the flight itself adds less than a millimetre of curvature in a sample.
-    assert entry.error_mm == pytest.approx(40.3, abs=0.5)
-    assert entry.step_mm == pytest.approx(40.6, abs=0.7)
-    assert breaks.interruptions(run, None)[0].error_mm is None
-    assert breaks.interruptions(run_of(tmp_path, fused, trajectory(30.0)), None) == []
-
-
-CASES = {
-    'shutter (FFC)': ({'settling after FFC': 3, 'frozen': 9}, False, False),
-    'frames withheld': ({'frozen': 9}, False, False),
-    'no image': ({}, False, False),
-    'no marker in view': ({}, True, False),
-    'markers in view, no pose': ({}, True, True),
-}
-
-
-@pytest.mark.parametrize('cause', CASES)
-def test_why_there_was_no_pose(tmp_path, cause):
-    withheld, frames_come, seen = CASES[cause]
-    every = trajectory(30.0)
-    t = (every.stamps_ns - START_NS) * 1e-9
-    inside = (t > 5.0) & (t < 5.5)
-    output = RecordedOutput(
-        frames_ns=every.stamps_ns if frames_come else every.stamps_ns[~inside],
-        withheld=((START_NS + 5_000_000_000, {}), (START_NS + 6_000_000_000, withheld)),
-    )
-    stamps = every.stamps_ns[inside if seen else ~inside]
-    detections = Detections(
-        stamps, np.zeros(len(stamps), np.int64), np.zeros((len(stamps), 4, 2)), np.ones(len(stamps))
-    )
-    run = run_of(tmp_path, trajectory(200.0), every.take(~inside), output=output, detections=detections)
-    (entry,) = breaks.interruptions(run, None)
-    assert entry.cause.value == cause
-    assert entry.is_shutter == (cause == 'shutter (FFC)')
 
 
 # --- as available ------------------------------------------------------------------------------------
