@@ -115,4 +115,4 @@ def _step(title: str) -> Any:
 
 def _say(evaluation: Evaluation, numbers: dict[str, Any]) -> None:
     made = tables(evaluation, numbers)
-    print_tables(made[name] for name in ('pilot', 'accuracy', 'interruptions') if name in made)
+    print_tables(made[name] for name in ('pilot', 'pilot_always', 'accuracy', 'interruptions') if name in made)

@@ -7,7 +7,8 @@ from thermal_fiducial.cli.evaluate import print_tables
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.report.map_error import map_accuracy, marker_errors
-from thermal_fiducial.report.tables import map_error_table, number, Table
+from thermal_fiducial.report.table import number, Table
+from thermal_fiducial.report.tables import map_error_table
 
 
 def add_error(parser: argparse.ArgumentParser) -> None:

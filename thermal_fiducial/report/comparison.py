@@ -21,7 +21,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.page import evaluate_run
-from thermal_fiducial.report.tables import number, Table
+from thermal_fiducial.report.table import number, Table
 from thermal_fiducial.report.trajectory import Trajectory
 
 #: evo's own default [s].

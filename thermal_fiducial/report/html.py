@@ -13,7 +13,8 @@ from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.frames import FramePicture
 from thermal_fiducial.report.overview import Card, cards, facts
 from thermal_fiducial.report.space import scene_chart
-from thermal_fiducial.report.tables import Table, tables
+from thermal_fiducial.report.table import Table
+from thermal_fiducial.report.tables import tables
 from thermal_fiducial.report.time_plots import Chart
 from thermal_fiducial.report.verdict import judge, RunVerdict
 
@@ -95,14 +96,21 @@ def report_page(evaluation: Evaluation, numbers: dict[str, Any], pictures: list[
 
     no_bag = '' if pictures else 'No frames are shown: the bag is not where it was (--bag names it).'
     sections = (
-        Section('errors', 'Errors', _errors(evaluation), some('pilot', 'accuracy', 'consistency')),
+        Section(
+            'errors',
+            'Errors',
+            _errors(evaluation),
+            some('pilot', 'pilot_always', 'at_frames', 'accuracy', 'consistency'),
+        ),
         Section('space', 'Path and map', tuple(scene_chart(evaluation)), some('map', 'tags')),
         Section('pose', 'Pose', tuple(charts.pose_charts(evaluation)), some('output')),
         Section('frames', 'Frames', pictures=tuple(pictures), note=no_bag, video=video),
         Section('markers', 'Markers', tuple(charts.detections_chart(evaluation)), some('markers', 'interruptions')),
         Section('filter', 'Filter', _filter(evaluation), some('innovations')),
         Section('speed', 'Latency', tuple(charts.latency_chart(evaluation)), some('latency', 'load')),
-        Section('nodes', 'Nodes', tables=some('diagnostics', 'figures')),
+        Section(
+            'nodes', 'Nodes', tables=some('diagnostics', *(name for name in made if name.startswith('figures of ')))
+        ),
     )
     return Page(
         title=str(evaluation.run.summary.get('bag', evaluation.run.path.name)),

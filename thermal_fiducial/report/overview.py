@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from thermal_fiducial.report.evaluation import Evaluation
-from thermal_fiducial.report.tables import number
+from thermal_fiducial.report.table import number
 
 
 @dataclass(frozen=True)

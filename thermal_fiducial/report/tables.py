@@ -1,49 +1,10 @@
 """The measures as tables of text, for page and terminal."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
-from thermal_fiducial.files.innovations import INNOVATIONS
 from thermal_fiducial.report.evaluation import Evaluation
-
-#: Most columns of a table that stands beside another one.
-_NARROW = 4
-
-
-@dataclass(frozen=True)
-class Table:
-    """A title, column heads with units, and rows of cells; ``words``: left-aligned text columns."""
-
-    title: str
-    heads: tuple[str, ...]
-    rows: Sequence[tuple[str, ...]]
-    words: tuple[str, ...] = ('unit', 'status', 'why')
-
-    def is_text(self, column: int) -> bool:
-        """Whether a column contains text; the first one always does."""
-        return column == 0 or self.heads[column] in self.words
-
-    @property
-    def is_wide(self) -> bool:
-        """Whether the table takes the width of the page."""
-        return len(self.heads) > _NARROW
-
-    def of(self, columns: Sequence[int]) -> 'Table':
-        """The table with some of the columns."""
-        rows = [tuple(row[column] for column in columns) for row in self.rows]
-        return Table(self.title, tuple(self.heads[column] for column in columns), rows, self.words)
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """``value`` with ``digits`` significant digits, without exponent."""
-    if value is None:
-        return '–'
-    if value == 0.0:
-        return '0'
-    text = f'{value:.{digits}g}'
-    return f'{value:.0f}' if 'e+' in text else f'{float(text):.6f}'.rstrip('0').rstrip('.') if 'e-' in text else text
-
+from thermal_fiducial.report.node_tables import figures_tables, load_table, said_table
+from thermal_fiducial.report.table import number, Table
 
 _BOTH = (
     ('position error, rms', 'mm', 'error', 'position_rms_mm'),
@@ -99,30 +60,11 @@ _SPREAD = (
     ('attitude error, 95 %', 'deg', 'attitude_p95_deg'),
 )
 
-#: Units of the nodes' figures; the others have none.
-_UNITS = {
-    'seconds since accepted pose': 's',
-    'position std': 'm',
-    'usable for': 's',
-    'time offset': 's',
-    'time offset std': 's',
-    'white pose error': 'sigma',
-    'stamp jitter': 's',
-    'mount vibration': 'rad',
-    'gyroscope bias': 'rad/s',
-    'accelerometer bias': 'm/s^2',
-    'gyroscope scale error': '1',
-    'accelerometer scale error': '1',
-    'map tilt': 'rad',
-}
-#: Figures left out: the table of innovations has them for the whole run, the nodes only for the latest poses.
-_ELSEWHERE = ('received ', 'published ', 'poses accepted', 'poses refused', 'NIS per d.o.f.', INNOVATIONS)
-
 
 def tables(evaluation: Evaluation, numbers: dict[str, Any]) -> dict[str, Table]:
     """All tables that are not empty, by topic."""
     made = {
-        'pilot': _pilot(numbers),
+        **_pilot(numbers),
         'accuracy': _accuracy(numbers),
         'consistency': _consistency(numbers),
         'innovations': _innovations(numbers),
@@ -132,15 +74,15 @@ def tables(evaluation: Evaluation, numbers: dict[str, Any]) -> dict[str, Table]:
         'markers': Table('Markers', ('', 'unit', ''), _pick(numbers['markers'], _MARKERS)),
         'map': map_error_table(numbers.get('map', {})),
         'tags': _tags(evaluation),
-        'load': _load(evaluation),
-        'diagnostics': _diagnostics(evaluation),
-        'figures': _figures(evaluation),
+        'load': load_table(evaluation),
+        'diagnostics': said_table(evaluation),
+        **figures_tables(evaluation),
     }
     return {name: table for name, table in made.items() if table.rows}
 
 
 def _pick(values: dict[str, Any], rows: tuple[tuple[str, str, str], ...]) -> list[tuple[str, ...]]:
-    return [(name, unit, number(values[key], 4)) for name, unit, key in rows if values.get(key) is not None]
+    return [(name, unit, number(values[key])) for name, unit, key in rows if values.get(key) is not None]
 
 
 def map_error_table(values: dict[str, Any]) -> Table:
@@ -157,27 +99,23 @@ def _accuracy(numbers: dict[str, Any]) -> Table:
     return Table('Accuracy of each pose at its own stamp', ('', 'unit', 'fused', 'markers alone'), rows)
 
 
-def _pilot(numbers: dict[str, Any]) -> Table:
-    """Errors as seen by a controller, beside those at the stamps of frames, which flatter the markers."""
+def _pilot(numbers: dict[str, Any]) -> dict[str, Table]:
+    """Errors as seen by a controller, and those at the stamps of frames, which flatter the markers."""
     held = numbers.get('as_available', {})
     cases = {
-        'markers in view': held.get('in_view', {}),
-        'always': held.get('always', {}),
-        "at frames' instants": numbers.get('at_frames', {}),
+        'pilot': ('What a controller has while markers are in view: the newest pose', held.get('in_view')),
+        'pilot_always': ('The same in the whole run, shutter events and drop-outs included', held.get('always')),
+        'at_frames': ("At frames' instants, when no controller has a pose yet", numbers.get('at_frames')),
     }
-    shown = {name: both for name, both in cases.items() if both}
-    rows = [
-        (name, unit, *(number(both[source].get(key)) for both in shown.values() for source in ('fused', 'markers')))
-        for name, unit, key in _SPREAD
-        if shown
-    ]
-    if held:
-        ages = [number(held['age_ms'][source]) for source in ('fused', 'markers')]
-        rows.append(
-            ('age of the newest pose, median', 'ms', *ages, *ages, *('0' for _ in ages if 'at_frames' in numbers))
-        )
-    heads = [f'{source}, {name}' for name in shown for source in ('fused', 'markers alone')]
-    return Table('What a controller has: the newest pose that had come, at each instant', ('', 'unit', *heads), rows)
+    made = {}
+    for name, (title, both) in cases.items():
+        columns = [both[source] for source in ('fused', 'markers')] if both else []
+        rows = [(words, unit, *(number(values[key]) for values in columns)) for words, unit, key in _SPREAD if columns]
+        if columns and both is not numbers.get('at_frames'):
+            ages = (number(held['age_ms'][source]) for source in ('fused', 'markers'))
+            rows.append(('age of the newest pose, median', 'ms', *ages))
+        made[name] = Table(title, ('', 'unit', 'fused', 'markers alone'), rows)
+    return made
 
 
 def _consistency(numbers: dict[str, Any]) -> Table:
@@ -261,37 +199,3 @@ def _tags(evaluation: Evaluation) -> Table:
         rows.append((*row, *(map(number, error) if with_errors else ()), tag.status, tag.why))
     errors = ('error [mm]', 'error [deg]') if with_errors else ()
     return Table('Markers, one by one', (*heads, *errors, 'status', 'why'), rows)
-
-
-def _diagnostics(evaluation: Evaluation) -> Table:
-    rows = [(said.node, said.level, said.message, str(said.count)) for said in evaluation.run.output.diagnostics]
-    heads = ('node', 'level', 'message', 'times [count]')
-    return Table('What the nodes said, once a second', heads, rows, heads[:3])
-
-
-def _load(evaluation: Evaluation) -> Table:
-    used = evaluation.run.summary.get('cpu_percent', {})
-    return Table('Processor load', ('', 'of one core [%]'), [(node, number(value)) for node, value in used.items()])
-
-
-def _figures(evaluation: Evaluation) -> Table:
-    """Figures of the nodes, without message counts and those of other tables."""
-    said = evaluation.run.summary.get('diagnostics', {})
-    rows = [
-        (node, *_split(name, str(value)))
-        for node, figures in said.items()
-        for name, value in figures.items()
-        if value not in ('', '0') and not name.startswith(_ELSEWHERE)
-    ]
-    heads = ('node', 'figure', 'value', 'unit')
-    return Table('What the nodes counted, at the end', heads, rows, heads)
-
-
-def _split(name: str, value: str) -> tuple[str, str, str]:
-    """Name without unit, value and unit of a figure."""
-    if name.startswith('vibration '):
-        return 'vibration', value, name.removeprefix('vibration ')
-    if name.endswith(']'):
-        name, _, unit = name[:-1].rpartition(' [')
-        return name, value, unit
-    return name, value, _UNITS.get(name, 'count' if value.isdigit() else '')

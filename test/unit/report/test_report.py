@@ -17,7 +17,8 @@ from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.overview import cards
 from thermal_fiducial.report.page import evaluate_run, write_report
 from thermal_fiducial.report.run_folder import read_run
-from thermal_fiducial.report.tables import number, tables
+from thermal_fiducial.report.table import number
+from thermal_fiducial.report.tables import tables
 
 pytest.importorskip('plotly')
 
@@ -268,8 +269,9 @@ def test_evaluate_prints_json(small_run, capsys):
 
 @pytest.mark.parametrize(
     ('value', 'text'),
-    [(0.0, '0'), (None, '–'), (1234.5, '1234'), (0.05604, '0.056'), (3.14159, '3.14'), (12345678.0, '12345678'),
-     (1.2e-5, '0.000012'), (-2.5, '-2.5'), (1e-9, '0')],
+    [(0.0, '0'), (None, '–'), (1234.5, '1234'), (0.05604, '0.0560'), (22.04, '22.0'), (200.0, '200'), (5962, '5962'),
+     (3.14159, '3.14'), (12345678.0, '12345678'),
+     (1.2e-5, '0.000012'), (-2.5, '-2.50'), (1e-9, '0')],
 )  # fmt: skip
 def test_numbers_are_written_plainly(value, text):
     assert number(value) == text
@@ -300,8 +302,9 @@ def test_visible_spans_break_at_gaps():
 def test_tables_omit_unknown_values(small_run):
     evaluation = evaluate(read_run(small_run))
     made = tables(evaluation, evaluation.numbers())
-    assert {'accuracy', 'pilot', 'tags'} <= made.keys()
-    assert not {'consistency', 'innovations', 'map', 'diagnostics', 'figures'} & made.keys()
+    assert {'accuracy', 'at_frames', 'tags'} <= made.keys()
+    assert not {'pilot', 'consistency', 'innovations', 'map', 'diagnostics'} & made.keys()
+    assert not any(name.startswith('figures') for name in made)
 
 
 def test_messages_of_nodes_are_counted_regardless_of_their_numbers(run_folder):
@@ -314,16 +317,22 @@ def test_messages_of_nodes_are_counted_regardless_of_their_numbers(run_folder):
 
 def test_figures_and_load_of_the_nodes(small_run):
     counted = {'withheld: FFC': '12', 'refused messages': '0', 'received /thermal/image_raw': '9'}
-    rates = {'rate /thermal/image_raw [Hz]': '29.9', 'vibration m/s^2/sqrt(Hz)': '0.0018'}
-    diagnostics = {'tau2_camera': counted | rates}
+    rates = {
+        'rate /thermal/image_raw [Hz]': '29.9',
+        'vibration m/s^2/sqrt(Hz)': '0.00181305',
+        'map tilt': '9.17798e-06',
+    }
+    diagnostics = {'tau2_camera': counted | rates, 'pose_ekf': {'resets': '0', 'in view': '2, 3'}}
     (small_run / 'summary.json').write_text(
         json.dumps({'diagnostics': diagnostics, 'cpu_percent': {'pose_ekf': 24.04}})
     )
     evaluation = evaluate(read_run(small_run))
     made = tables(evaluation, evaluation.numbers())
-    assert made['figures'].rows == [
-        ('tau2_camera', 'withheld: FFC', '12', 'count'),
-        ('tau2_camera', 'rate /thermal/image_raw', '29.9', 'Hz'),
-        ('tau2_camera', 'vibration', '0.0018', 'm/s^2/sqrt(Hz)'),
+    assert made['figures of tau2_camera'].rows == [
+        ('withheld: FFC', '12', 'count'),
+        ('rate /thermal/image_raw', '29.9', 'Hz'),
+        ('vibration', '0.001813', 'm/s^2/sqrt(Hz)'),
+        ('map tilt', '0.000009', 'rad'),
     ]
-    assert made['load'].rows == [('pose_ekf', '24')]
+    assert made['figures of pose_ekf'].rows == [('in view', '2, 3', '')]
+    assert made['load'].rows == [('pose_ekf', '24.0')]

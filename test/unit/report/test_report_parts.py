@@ -27,7 +27,7 @@ from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.map_error import map_accuracy, marker_errors
 from thermal_fiducial.report.output_bag import Arrivals, RecordedOutput
 from thermal_fiducial.report.run_folder import read_run
-from thermal_fiducial.report.tables import Table
+from thermal_fiducial.report.table import Table
 from thermal_fiducial.report.tags import tags
 from thermal_fiducial.report.time_plots import TimePlots
 from thermal_fiducial.report.trajectory import Trajectory
@@ -136,8 +136,8 @@ def test_error_of_a_map_against_the_true_one(tmp_path, capsys, monkeypatch):
     save_map(tmp_path / 'map.yaml', MarkerMap(true.markers | {5: replace(marker, T_map_marker=T)}))
     assert main(['map', 'error', str(tmp_path / 'map.yaml'), str(tmp_path / 'true.yaml')]) == 0
     printed = capsys.readouterr().out
-    assert re.search(r'position error, largest +mm +5 ', printed)
-    assert re.search(r'\n +5 +5 +0 ', printed)
+    assert re.search(r'position error, largest +mm +5.00 ', printed)
+    assert re.search(r'\n +5 +5\.00 +0 ', printed)
     save_map(tmp_path / 'other.yaml', MarkerMap({1: replace(marker, id=1)}))
     assert main(['map', 'error', str(tmp_path / 'map.yaml'), str(tmp_path / 'other.yaml')]) == 2
     assert 'no marker in common' in capsys.readouterr().err
