@@ -43,13 +43,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--compare', action='store_true', help="several runs side by side, with evo's conventions and numbers"
     )
-    parser.add_argument('--out', type=file_to_write, default=COMPARISON, metavar='HTML', help='page of --compare')
+    parser.add_argument('--out', type=file_to_write, metavar='HTML', help=f'page of --compare (default: {COMPARISON})')
 
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate a run, print the tables, write ``summary.json`` and ``report.html``."""
     if args.compare:
         return _compare(args)
+    if args.out is not None:
+        raise InputError('--out names the page of --compare; the report of a run is written into its folder')
     if len(args.folders) > 1:
         raise InputError('several runs are shown side by side with --compare')
     if not args.no_report:
@@ -79,6 +81,10 @@ def make_video(run: Run, bag: Path | None = None) -> None:
 
 
 def _compare(args: argparse.Namespace) -> int:
+    alone = {'--truth-map': args.truth_map, '--bag': args.bag, '--video': args.video}
+    for name in (name for name, given in alone.items() if given):
+        raise InputError(f'{name} is for one run, not for --compare')
+    page = args.out or COMPARISON
     try:
         from thermal_fiducial.report.comparison import compare
     except ImportError as error:
@@ -91,8 +97,8 @@ def _compare(args: argparse.Namespace) -> int:
         if comparison.note:
             print(comparison.note)
     if not args.no_report:
-        comparison.write(args.out)
-        print(f'comparison: {args.out}')
+        comparison.write(page)
+        print(f'comparison: {page}')
     return 0
 
 

@@ -37,7 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'real time',
     )
     parser.add_argument(
-        '--rate', type=float, default=1.0, metavar='X', help='speed of --transport processes, in multiples of real time'
+        '--rate',
+        type=float,
+        metavar='X',
+        help='speed of --transport processes, in multiples of real time (default: 1)',
     )
     parser.add_argument(
         '--second-camera',
@@ -61,8 +64,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay the bag, write the run folder, print a summary."""
-    if not 0.0 < args.rate <= 100.0:
+    if args.rate is not None and not 0.0 < args.rate <= 100.0:
         raise InputError(f'--rate {args.rate:g} is not between 0 and 100')
+    if args.rate is not None and args.transport != 'processes':
+        raise InputError('--rate is for --transport processes: in lock-step the nodes are as fast as they can be')
     refuse_other_folder(args.out)
     _check_packages(report=not args.no_report, video=args.video)
     replay = importlib.import_module('thermal_fiducial.replay.session')
@@ -73,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         map_file=args.map,
         mode=args.mode,
         transport=args.transport,
-        rate=args.rate,
+        rate=args.rate or 1.0,
         images=args.images,
         entry=args.entry,
         second_camera=args.second_camera.strip('/'),
@@ -93,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
             importlib.import_module('thermal_fiducial.report.run_folder').read_run(args.out)
         )
     if not args.no_report:
-        importlib.import_module('thermal_fiducial.report.page').write_report(args.out, truth=None)
+        _report(args.out)
     errors = _internal_errors(summary['diagnostics'])
     for error in errors:
         print(error, file=sys.stderr)
@@ -109,6 +114,15 @@ def _check_packages(*, report: bool, video: bool) -> None:
             raise InputError(f'{error}, or replay with --no-report') from None
     if video:
         importlib.import_module('thermal_fiducial.report.video').require_encoder()
+
+
+def _report(run: Path) -> None:
+    """Write the report, and print where it is and its first line."""
+    page = importlib.import_module('thermal_fiducial.report.page')
+    evaluation, numbers = page.evaluate_run(run)
+    path = page.write_page(evaluation, numbers)
+    verdict = importlib.import_module('thermal_fiducial.report.verdict').judge(evaluation, numbers)
+    print(f'{path}: {verdict.headline}')
 
 
 def _internal_errors(diagnostics: Mapping[str, Mapping[str, str]]) -> list[str]:

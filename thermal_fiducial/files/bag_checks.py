@@ -1,5 +1,6 @@
 """Validation of a bag: before the library opens it, and of the metadata that the library returns."""
 
+import os
 from pathlib import Path
 
 from rosbags.rosbag1 import Reader as Rosbag1Reader
@@ -13,6 +14,8 @@ from thermal_fiducial.files.schema import load_yaml
 SINGLE_FILES = ('.mcap', '.db3', '.bag')
 #: Suffixes of a bag's files; other files in its folder are not opened.
 _SUFFIXES = (*SINGLE_FILES, '.zstd')
+#: First and last bytes of an mcap file.
+_MCAP_MAGIC = b'\x89MCAP0\r\n'
 _ROS1_BEGIN = b'#ROSBAG V2.0\n'
 _LARGEST_NUMBER = 2**63
 
@@ -21,10 +24,22 @@ def check_file(path: Path) -> None:
     """Raise InputError for files on which the library would block, or which it would read whole before refusing."""
     if path.suffix in _SUFFIXES:
         require_regular(path)
+    if path.suffix == '.mcap':
+        _check_mcap(path)
     if path.suffix == '.bag':
         with path.open('rb') as file:
             if file.read(len(_ROS1_BEGIN)) != _ROS1_BEGIN:
                 raise InputError(f'{path}: no bag of ROS 1 (2.0)')
+
+
+def _check_mcap(path: Path) -> None:
+    """Raise InputError for a recording that was cut off: it has the beginning of a file, but not its end."""
+    with path.open('rb') as file:
+        begin = file.read(len(_MCAP_MAGIC))
+        file.seek(-min(path.stat().st_size, len(_MCAP_MAGIC)), os.SEEK_END)
+        end = file.read()
+    if begin == _MCAP_MAGIC != end:
+        raise InputError(f'{path}: the recording of this bag was cut off, or goes on: mcap recover {path} -o NEW.mcap')
 
 
 def check_metadata(path: Path) -> None:

@@ -280,4 +280,6 @@ class BagReader:
 def _remedy(topic: str) -> str:
     """What to do about a topic that a bag lacks."""
     remap = 'remap another to it'
+    if topic == TRUTH_TOPIC:
+        return 'give a TUM file'
     return f'{remap}, or give a calibration_file' if topic == CAMERA_INFO_TOPIC else remap

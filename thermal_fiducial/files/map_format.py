@@ -111,11 +111,11 @@ def _document(root: Value) -> MapDocument:
 
 def _head(root: Value) -> dict[str, Value]:
     """The fields of a file with the marker map's ``format``."""
-    if not isinstance(root.content, dict):
+    kind = root.content.get('format') if isinstance(root.content, dict) else None
+    if kind is None:
         raise root.error(f'not a marker map: no "format: {FORMAT}"')
-    kind = root.content.get('format')
-    if kind is None or kind.content != FORMAT:
-        raise root.error(f'not a marker map: format {"missing" if kind is None else kind.quoted()} is not {FORMAT!r}')
+    if kind.content != FORMAT:
+        raise root.error(f'not a marker map: format {kind.quoted()} is not {FORMAT!r}')
     return root.mapping({'format', 'version', *_names(MapDocument)})
 
 

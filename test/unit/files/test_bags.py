@@ -138,6 +138,8 @@ def test_missing_topics_are_named_beside_the_recorded_ones(tmp_path):
             bag.require({'thermal/image_raw': IMAGE})
         with pytest.raises(InputError, match='remap another to it, or give a calibration_file'):
             bag.require({'thermal/camera_info': 'sensor_msgs/msg/CameraInfo'})
+        with pytest.raises(InputError, match=r'no topic ground_truth/odometry \(give a TUM file\?\)'):
+            bag.require({'ground_truth/odometry': 'nav_msgs/msg/Odometry'})
         with pytest.raises(InputError, match=f'imu/data is {STRING}, not {IMU}'):
             bag.require({'imu/data': IMU})
 
@@ -201,6 +203,19 @@ def test_truncated_bag(tmp_path, storage, share):
     with pytest.raises(InputError, match='bag') as raised:
         read_all(folder)
     assert '\n' not in str(raised.value)
+
+
+@pytest.mark.parametrize('bytes_left', [8, -8, -1])
+def test_a_recording_that_was_cut_off_names_the_remedy(tmp_path, bytes_left):
+    """As after a crash or a loss of power, when no end is written."""
+    folder = write(tmp_path / 'bag')
+    (file,) = folder.glob('*.mcap')
+    file.write_bytes(file.read_bytes()[:bytes_left] + b'\0')
+    for path in (folder, file):
+        with pytest.raises(InputError) as raised:
+            read_all(path)
+        remedy = f'the recording of this bag was cut off, or goes on: mcap recover {file} -o NEW.mcap'
+        assert str(raised.value) == f'{file}: {remedy}'
 
 
 @pytest.mark.parametrize('name', ['a.bag', 'a.mcap', 'a.db3', 'a.txt'])

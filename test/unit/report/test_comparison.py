@@ -75,7 +75,14 @@ def test_the_page_and_the_tables(runs, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.parametrize(
     ('arguments', 'words'),
-    [(['a', 'b'], '--compare'), (['a', '--compare'], 'two runs or more'), (['a', 'a', '--compare'], 'given twice')],
+    [
+        (['a', 'b'], '--compare'),
+        (['a', '--compare'], 'two runs or more'),
+        (['a', 'a', '--compare'], 'given twice'),
+        (['a', '--out', 'page.html'], 'page of --compare'),
+        (['a', 'b', '--compare', '--video'], '--video is for one run'),
+        (['a', 'b', '--compare', '--truth-map', 'm.yaml'], '--truth-map is for one run'),
+    ],
 )
 def test_what_cannot_be_compared(runs, capsys, arguments, words):
     folder = runs[0].parent
