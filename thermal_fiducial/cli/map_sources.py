@@ -1,8 +1,11 @@
 """``map build`` and ``map refine``: maps from photos and from the detections of a run."""
 
 import argparse
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+import re
 
 import numpy as np
 
@@ -95,11 +98,12 @@ def _build(args: argparse.Namespace) -> int:
     args.marker_size = args.marker_size or _only_size(start)
     if args.marker_size is None:
         raise InputError(f'{args.map}: its markers have several sizes: give --marker-size for new ones')
-    frames = detect_in_photos(photos_in(args.images), camera, args)
+    photos = photos_in(args.images)
+    frames = detect_in_photos(photos, camera, args)
     if args.origin is not None and not any(args.origin in rows['id'] for rows in frames):
         origin = f'marker {args.origin} of {args.dictionary}'
         raise InputError(f'{args.images}: {origin}, the origin, is in none of the {len(frames)} photos')
-    return _grow(args, frames, camera, start, work)
+    return _grow(args, frames, camera, start, work, [photo.name for photo in photos])
 
 
 def _refine(args: argparse.Namespace) -> int:
@@ -124,13 +128,18 @@ def _only_size(marker_map: MarkerMap) -> float | None:
 
 
 def _grow(
-    args: argparse.Namespace, frames: list[Markers], camera: Camera, start: MarkerMap, work: _MapInProgress
+    args: argparse.Namespace,
+    frames: list[Markers],
+    camera: Camera,
+    start: MarkerMap,
+    work: _MapInProgress,
+    names: Sequence[str] = (),
 ) -> int:
     start = map_editing.with_covariances(start, _HAND_STD_M, np.deg2rad(_HAND_STD_DEG))
     config = _mapper_config(args, start.dictionary)
     with progress_bar('mapping') as progress:
         built = build_map(frames, camera, start, config, lambda markers, share: progress(share, f'{markers} markers'))
-    _print_what_was_used(built, len(frames))
+    _print_what_was_used(built, len(frames), names)
     work.save(built.map)
     print(f'{work.path}: {built.map.size_in_words}')
     return 2 if any(doubt.spoils for doubt in say_doubts(built.map, work.path)) else 0
@@ -154,8 +163,10 @@ def _doubts_of_dictionary(marker_map: MarkerMap, folder: Path) -> list[Doubt]:
     return [Doubt(f'marker {key}: not in {marker_map.dictionary}', True) for key in foreign]
 
 
-def _print_what_was_used(built: Built, frames: int) -> None:
+def _print_what_was_used(built: Built, frames: int, names: Sequence[str]) -> None:
+    """What the map was built of; ``names`` of the frames, if they have any."""
     print(f'{built.frames_used} of {frames} frames used')
+    _print_what_was_not(built.unused, names)
     if built.map.markers and all(marker.fixed for marker in built.map.markers.values()):
         print('all markers are fixed: none was moved (map unfix)')
     # Medians over each marker's views: the root mean square is dominated by a few outliers, and twenty times as large.
@@ -171,6 +182,17 @@ def _print_what_was_used(built: Built, frames: int) -> None:
             print(f'marker {key}: {share:.0f} % of its views disagree with the others; has it been moved?')
     for key, why in sorted(built.unplaced.items()):
         print(f'marker {key} is not in the map: {why}')
+
+
+def _print_what_was_not(unused: dict[int, str], names: Sequence[str]) -> None:
+    if names:
+        for frame, why in unused.items():
+            print(f'{names[frame]} not used: {why}')
+        return
+    # Of thousands of frames: how many for each reason, without its numbers.
+    reasons = Counter(re.sub(r'\d+', 'N', why.partition(',')[0]) for why in unused.values())
+    for why, count in reasons.most_common():
+        print(f'{count} not used: {why}')
 
 
 def _mapper_config(args: argparse.Namespace, dictionary: str) -> MarkerMapperConfig:

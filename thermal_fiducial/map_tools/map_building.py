@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -36,6 +36,8 @@ class Built:
     unplaced: dict[int, str]
     #: number of frames with a camera pose in the final map
     frames_used: int
+    #: index of each other frame, with the reason
+    unused: dict[int, str] = field(default_factory=dict)
 
 
 def build_map(
@@ -69,8 +71,9 @@ def build_map(
         if len(mapper.map.markers) == before and not _settle(mapper, camera):
             break
     unplaced = {key: why for key, why in waiting.items() if key not in mapper.map.markers}
-    used, errors = _residuals(mapper.map, frames, camera, config)
-    return Built(_with_statistics(mapper.map, frames, marker_map, errors), refinement, unplaced, used)
+    unused, errors = _residuals(mapper.map, frames, camera, config)
+    final = _with_statistics(mapper.map, frames, marker_map, errors)
+    return Built(final, refinement, unplaced, len(frames) - len(unused), unused)
 
 
 def _stamp(k: int) -> int:
@@ -113,25 +116,26 @@ def decide(snapshot: Snapshot, marker_id: int, size: float, alternatives: Sequen
 
 def _residuals(
     built: MarkerMap, frames: Sequence[Markers], camera: Camera, config: MarkerMapperConfig
-) -> tuple[int, dict[int, float]]:
-    """Number of frames that are located in the map, and each marker's re-projection error in them [px].
+) -> tuple[dict[int, str], dict[int, float]]:
+    """Frames that are not located in the map with the reason, and each marker's re-projection error in the others [px].
 
     The error is the median over the views; the mapper's own is a running mean from before the adjustment.
     """
     mapper = MarkerMapper(replace(config, mode='localization'), built)
-    used, errors = 0, defaultdict[int, list[float]](list)
+    unused, errors = dict[int, str](), defaultdict[int, list[float]](list)
     for k, rows in enumerate(frames):
-        pose = mapper.process(_stamp(k), rows, camera).pose
+        result = mapper.process(_stamp(k), rows, camera)
+        pose = result.pose
         if pose is None:
+            unused[k] = result.reason
             continue
-        used += 1
         for marker_id, seen in zip(rows['id'].tolist(), corners_px(rows), strict=True):
             marker = built.markers.get(marker_id)
             if marker is not None:
                 corners = corners_in_map(marker.T_map_marker, marker.size)
                 off = reproject(camera, pose.T_map_camera, corners) - seen
                 errors[marker_id].append(float(np.sqrt(np.mean(off**2))))
-    return used, {marker_id: float(np.median(values)) for marker_id, values in errors.items()}
+    return unused, {marker_id: float(np.median(values)) for marker_id, values in errors.items()}
 
 
 def _with_statistics(

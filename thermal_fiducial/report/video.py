@@ -14,6 +14,8 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.packages import is_installed
+from thermal_fiducial.files.reading import naming
+from thermal_fiducial.files.writing import new_file
 from thermal_fiducial.report.frames import annotated, bag_of, views, write
 from thermal_fiducial.report.interruptions import Cause, interruptions
 from thermal_fiducial.report.run_folder import Run
@@ -70,16 +72,13 @@ def write_video(
         first = next(frames, None)
         if first is None:
             raise InputError(f'{found[0]}: no video: the bag has no usable frame')
-        try:
-            with (_ffmpeg if encoder == 'ffmpeg' else _pyav)(path, first, rate) as take:
-                take(first)
-                for index, frame in enumerate(frames, 2):
-                    take(frame)
-                    progress(min(1.0, index / count))
-        except BaseException:
-            # An incomplete video is useless.
-            path.unlink(missing_ok=True)
-            raise
+        # An incomplete video is useless, and the report may show an earlier one.
+        encode = _ffmpeg if encoder == 'ffmpeg' else _pyav
+        with new_file(path) as new, naming(path), encode(new, first, rate) as take:
+            take(first)
+            for index, frame in enumerate(frames, 2):
+                take(frame)
+                progress(min(1.0, index / count))
 
 
 def _rate(reader: BagReader, count: int) -> float:
@@ -139,7 +138,7 @@ def _ffmpeg(path: Path, first: Frame, rate: float) -> Iterator[Callable[[Frame],
             process.stdin.close()
         said = process.stderr.read().decode(errors='replace').strip()
         if process.wait():
-            raise InputError(f'{path}: ffmpeg cannot write the video: {said.splitlines()[-1] if said else "no reason"}')
+            raise InputError(f'ffmpeg cannot write the video: {said.splitlines()[-1] if said else "no reason"}')
 
 
 def _feed(pipe: Any, frame: Frame) -> None:
@@ -165,4 +164,4 @@ def _pyav(path: Path, first: Frame, rate: float) -> Iterator[Callable[[Frame], N
             yield take
             container.mux(stream.encode())
     except (OSError, av.error.FFmpegError) as error:
-        raise InputError(f'{path}: PyAV cannot write the video: {error.strerror or error}') from None
+        raise InputError(f'PyAV cannot write the video: {error.strerror or error}') from None

@@ -191,6 +191,15 @@ def detections(poses, side=SIZE):
     return f'stamp_ns,id,{",".join(CORNER_FIELDS)},sigma_px\n' + '\n'.join(lines)
 
 
+def test_refine_counts_the_frames_that_gave_nothing_by_reason(path, poses, photographed, capsys):
+    save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
+    lines = photographed[0].read_text().splitlines()
+    _, _, corners = lines[1].split(',', 2)
+    photographed[0].write_text('\n'.join([*lines, *(f'{stamp(k)},40,{corners}' for k in (400, 500))]))
+    assert run('--marker-size', SIZE, 'refine', path, *photographed) == 0
+    assert '30 of 32 frames used\n2 not used: no known marker in view\n' in capsys.readouterr().out
+
+
 @pytest.fixture
 def photographed(path, poses):
     """Detections of a flight past the wall, and the calibration of its camera."""

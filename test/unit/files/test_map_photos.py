@@ -1,5 +1,7 @@
 """Maps from photos, in the dictionary that the map is of."""
 
+import shutil
+
 import cv2
 import numpy as np
 import pytest
@@ -64,6 +66,16 @@ def test_photos_are_read_in_the_dictionary_of_the_map(photographed, poses, tmp_p
         d = difference(built.markers[key].T_map_marker, T)
         assert np.linalg.norm(d[:3]) < 0.03
         assert np.linalg.norm(d[3:]) < 0.05
+
+
+def test_a_photo_that_gave_nothing_is_named_with_its_reason(photographed, poses, tmp_path, capsys):
+    start = tmp_path / 'start.yaml'
+    save_map(start, MarkerMap({2: MapMarker(2, SIZE, True, poses[2])}, dictionary=DICTIONARY))
+    folder = shutil.copytree(photographed[0], tmp_path / 'photos')
+    cv2.imwrite(str(folder / 'blank.png'), np.full((CAMERA.height, CAMERA.width), 255, np.uint8))
+    assert build([folder, *photographed[1:]], '--map', start, '--out', tmp_path / 'hall.yaml') == 0
+    printed = capsys.readouterr().out
+    assert '12 of 13 frames used\nblank.png not used: no known marker in view\n' in printed
 
 
 def test_photos_in_another_dictionary_than_that_of_the_map_are_refused(photographed, poses, tmp_path, capsys):

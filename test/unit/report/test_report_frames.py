@@ -149,6 +149,20 @@ def test_a_video_of_all_frames(flight, encoder, monkeypatch):
     assert shares[-1] == 1.0
 
 
+@needs_encoder
+def test_an_interrupt_leaves_the_earlier_video(flight):
+    folder = flight / 'videos'
+    folder.mkdir()
+    (folder / 'flight.mp4').write_bytes(b'earlier')
+
+    def interrupt(share):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        video.write_video(read_run(flight / 'run'), folder / 'flight.mp4', progress=interrupt)
+    assert [(path.name, path.read_bytes()) for path in folder.iterdir()] == [('flight.mp4', b'earlier')]
+
+
 def test_letters_can_be_read_on_white():
     on_black, on_white = np.zeros((40, 200, 3), np.uint8), np.full((40, 200, 3), 255, np.uint8)
     for picture in (on_black, on_white):
