@@ -55,9 +55,9 @@ def _compared(name: str, unit: str, numbers: dict[str, Any], key: str) -> Card |
     """Card of an error as seen by a controller if known, else at each pose's stamp."""
     held = numbers.get('as_available', {}).get('in_view')
     if held:
-        return Card(
-            name, number(held['fused'][key]), unit, f'rms, as available; markers alone {number(held["markers"][key])}'
-        )
+        others = number(held['markers'][key])
+        note = f'rms, as available while markers are in view; markers alone {others}'
+        return Card(name, number(held['fused'][key]), unit, note)
     error = numbers['fused'].get('error', {}).get(key)
     if error is None:
         return None

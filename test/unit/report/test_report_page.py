@@ -125,7 +125,7 @@ def test_the_overview_states_its_verdicts_in_sentences(page):
         '1 shutter event, the longest 0.5 s',
         '1 drop-out of up to 1.0 s (no marker in view)',
         'The covariance is consistent',
-        'as available; markers alone',
+        'as available while markers are in view; markers alone',
         'of 180 camera poses were refused',
     ):
         assert words in overview, words
