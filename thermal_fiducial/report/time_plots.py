@@ -25,6 +25,8 @@ CAUSES = {
 MOST_POINTS, MOST_DOTS = 12_000, 3_000
 #: Height of one of the stacked plots, and of the margins around all [px].
 ROW_PX, AROUND_PX = 128, 92
+#: Values under the pointer, as in the tables: four digits (of D3's format).
+_HOVER = '.4~g'
 # Tick digits of a logarithmic axis, by its number of decades.
 _LOG_TICKS = ((2, (1, 2, 5)), (4, (1, 3)), (np.inf, (1,)))
 
@@ -68,7 +70,8 @@ class TimePlots:
             hovermode='x unified',
         )
         for row, label in enumerate(labels, 1):
-            self.figure.update_yaxes(title_text=label, title_standoff=6, row=row, col=1)
+            self.figure.update_yaxes(title_text=label, title_standoff=6, hoverformat=_HOVER, row=row, col=1)
+        self.figure.update_xaxes(hoverformat='.3f')
         self.figure.update_xaxes(title_text='time [s]', row=rows, col=1)
         self._named: set[str] = set()
 
