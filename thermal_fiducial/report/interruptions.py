@@ -14,6 +14,9 @@ from thermal_fiducial.report.run_folder import Run
 GAP_NS = 300_000_000
 #: Camera periods without a frame above which frames are missing, not just late: the shutter drops several.
 _HOLE_PERIODS = 2.5
+#: Longest time without a frame that a shutter event explains [ns]. A Tau 2 needs some 0.5 s for 8 frames behind the
+#: shutter, 0.8 s for 16; and what is withheld is counted once a second.
+_LONGEST_SHUTTER_NS = 2_000_000_000
 #: Largest difference of a stamp and its recording on one clock [ns].
 ONE_CLOCK_NS = 500_000_000
 
@@ -97,7 +100,18 @@ def _shutter_holes(run: Run) -> list[tuple[int, int]]:
 
 
 def _names_shutter(run: Run, start_ns: int, end_ns: int) -> bool:
+    if end_ns - start_ns > _LONGEST_SHUTTER_NS:
+        return False
     return any(SHUTTER in reason for reason in run.output.withheld_between(start_ns, end_ns))
+
+
+def _are_withheld(run: Run, start_ns: int, end_ns: int) -> bool:
+    """Whether frames that came and were withheld account for a hole, rather than those of a shutter event before it."""
+    count = sum(run.output.withheld_between(start_ns, end_ns).values())
+    if end_ns - start_ns <= _LONGEST_SHUTTER_NS:
+        return count > 0
+    period = float(np.median(np.diff(run.output.frames_ns))) if len(run.output.frames_ns) > 1 else FRAME_NS
+    return count * period > (end_ns - start_ns) / 2
 
 
 def _cause(run: Run, start_ns: int, end_ns: int) -> Cause:
@@ -110,7 +124,7 @@ def _cause(run: Run, start_ns: int, end_ns: int) -> Cause:
         if hole[1] - hole[0] > (end_ns - start_ns) / 2:
             if _names_shutter(run, *hole):
                 return Cause.SHUTTER
-            return Cause.WITHHELD if run.output.withheld_between(*hole) else Cause.NO_IMAGE
+            return Cause.WITHHELD if _are_withheld(run, *hole) else Cause.NO_IMAGE
     stamps = run.detections.stamps_ns + run.offset_ns
     return Cause.UNUSED if np.any(_strictly_between(stamps, start_ns, end_ns)) else Cause.NO_MARKERS
 

@@ -69,12 +69,15 @@ class RecordedOutput:
     def withheld_between(self, start_ns: int, end_ns: int) -> dict[str, int]:
         """Frames dropped between two times by reason; counted once a second, so up to a second more."""
         before: dict[str, int] = {}
+        after: dict[str, int] = {}
         for time_ns, counts in self.withheld:
             if time_ns <= start_ns:
                 before = counts
-            elif time_ns >= end_ns:
-                return {reason: n - before.get(reason, 0) for reason, n in counts.items() if n > before.get(reason, 0)}
-        return {}
+            else:
+                after = counts
+            if time_ns >= end_ns:
+                break
+        return {reason: n - before.get(reason, 0) for reason, n in after.items() if n > before.get(reason, 0)}
 
 
 def read_output(path: Path, offset_ns: int) -> RecordedOutput:

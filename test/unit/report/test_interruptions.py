@@ -97,3 +97,28 @@ def test_why_there_was_no_pose(tmp_path, cause):
     (entry,) = breaks.interruptions(run, None)
     assert entry.cause.value == cause
     assert entry.is_shutter == (cause == 'shutter (FFC)')
+
+
+@pytest.mark.parametrize(
+    ('withheld', 'cause'),
+    # A shutter event drops some 15 frames, a camera that stands still all of them: 30 a second for 5 s.
+    [
+        ({'settling after FFC': 3, 'frozen': 12}, 'no image'),
+        ({'settling after FFC': 3, 'frozen': 150}, 'frames withheld'),
+    ],
+)
+@pytest.mark.parametrize('back_s', [10.0, SECONDS])
+def test_a_camera_that_is_gone_for_seconds_after_a_shutter_event_is_not_in_its_shutter(
+    tmp_path, withheld, cause, back_s
+):
+    """What is withheld is counted once a second: an event just before the hole is in its count."""
+    every = trajectory(30.0)
+    t = (every.stamps_ns - START_NS) * 1e-9
+    left = every.take((t < 5.0) | (t > back_s))
+    samples = ((4.0, {}), (6.0, withheld), (10.5, withheld))
+    output = RecordedOutput(
+        frames_ns=left.stamps_ns, withheld=tuple((START_NS + round(1e9 * at), counts) for at, counts in samples)
+    )
+    (entry,) = breaks.interruptions(run_of(tmp_path, trajectory(200.0), left, output=output), None)
+    assert entry.cause.value == cause
+    assert not entry.is_shutter
