@@ -31,6 +31,23 @@ def test_a_port_of_shared_memory_that_was_deleted_is_noticed():
         assert replaced_ports() == [port]
 
 
+@pytest.mark.parametrize('error', [FileNotFoundError, ProcessLookupError])
+def test_a_thread_that_has_ended_since_it_was_listed_is_no_error(monkeypatch, error):
+    """Before its file is opened, or between that and reading it."""
+    named = Path.read_text
+
+    def ended(file):
+        if file.name == 'comm' and file.parent.name != str(threading.get_native_id()):
+            raise error(file)
+        return named(file)
+
+    with ros_graph() as graph:
+        graph.spin_until(listening)
+        monkeypatch.setattr(Path, 'read_text', ended)
+        assert replaced_ports() == []
+
+
+@pytest.mark.nightly
 def test_threads_that_end_at_that_moment_are_no_error():
     """Each look lists this process's threads and then reads their names, and in between some have ended."""
     done = threading.Event()

@@ -15,8 +15,8 @@ pytestmark = pytest.mark.ros
 
 #: As much as a pipe may hold at least; the default is 16 times that.
 PAGE = 4096
-#: Far more lines than that, and a stop request; the alarm ends a node that hangs. They take a second by themselves, and
-#: twenty where fifteen others want the processor.
+#: Far more lines than that, and a stop request; the alarm ends a node that hangs. It is run from a file, as a node is:
+#: of a program behind ``-c`` rclpy looks for the file in vain with every line, for a millisecond each.
 PROGRAM = """
 import os, signal, sys
 from support.empty_stage import EmptyStage
@@ -43,6 +43,14 @@ class Refused(EmptyStage):
 signal.alarm(50)
 sys.exit(run({'talks': Stage, 'refused': Refused}[sys.argv[1]], []))
 """
+
+
+@pytest.fixture
+def command(tmp_path):
+    """What runs one of the nodes, but for its name."""
+    file = tmp_path / 'stage.py'
+    file.write_text(PROGRAM)
+    return [sys.executable, str(file)]
 
 
 def full_pipe():
@@ -79,22 +87,22 @@ def stuck_socket():
         pytest.param(stuck_socket, 'talks', 0, marks=pytest.mark.nightly),
     ],
 )
-def test_a_node_whose_output_nobody_reads_works_on_and_ends_as_it_should(make, way, status):
+def test_a_node_whose_output_nobody_reads_works_on_and_ends_as_it_should(command, make, way, status):
     writing, reading = make()
     try:
-        command = [sys.executable, '-c', PROGRAM, way]
-        done = subprocess.run(command, stdout=writing, stderr=writing, timeout=60, check=False, env=environment())
+        done = subprocess.run(
+            [*command, way], stdout=writing, stderr=writing, timeout=60, check=False, env=environment()
+        )
         assert done.returncode == status
     finally:
         os.close(writing)
         os.close(reading)
 
 
-def test_other_programs_at_the_same_pipe_still_wait_for_their_reader():
+def test_other_programs_at_the_same_pipe_still_wait_for_their_reader(command):
     reading, writing = os.pipe()
     with os.fdopen(reading):
-        command = [sys.executable, '-c', PROGRAM, 'talks']
-        done = subprocess.run(command, stderr=writing, timeout=60, check=False, env=environment())
+        done = subprocess.run([*command, 'talks'], stderr=writing, timeout=60, check=False, env=environment())
         assert (done.returncode, os.get_blocking(writing)) == (0, True)
         os.close(writing)
 
@@ -102,19 +110,18 @@ def test_other_programs_at_the_same_pipe_still_wait_for_their_reader():
 @pytest.mark.parametrize(
     'closing', ['>&- 2>&-', *(pytest.param(closing, marks=pytest.mark.nightly) for closing in ('2>&-', '2>/dev/null'))]
 )
-def test_a_node_without_a_console_runs(closing):
-    line = f'exec "$0" -c "$1" talks {closing}'
-    done = subprocess.run(['sh', '-c', line, sys.executable, PROGRAM], timeout=60, check=False, env=environment())
+def test_a_node_without_a_console_runs(command, closing):
+    line = f'exec "$0" "$1" talks {closing}'
+    done = subprocess.run(['sh', '-c', line, *command], timeout=60, check=False, env=environment())
     assert done.returncode in (0, -signal.SIGPROF)
 
 
-def test_what_is_written_to_a_file_is_complete(tmp_path):
+def test_what_is_written_to_a_file_is_complete(command, tmp_path):
     """Also behind what it held before."""
     log = tmp_path / 'log'
     log.write_text('before\n')
     with log.open('a') as file:
-        command = [sys.executable, '-c', PROGRAM, 'refused']
-        done = subprocess.run(command, stderr=file, timeout=60, check=False, env=environment())
+        done = subprocess.run([*command, 'refused'], stderr=file, timeout=60, check=False, env=environment())
     lines = log.read_text().splitlines()
     assert (done.returncode, len(lines)) == (2, 2002)
-    assert (lines[0], lines[-1]) == ('before', '-c: no such file')
+    assert (lines[0], lines[-1]) == ('before', 'stage.py: no such file')
