@@ -33,6 +33,8 @@ CARPETS = ('carpet_mountain', 'carpet_slow_circle')
 #: Corner noise [px]: what re-projection leaves of the board's corners, and the median that it leaves of the carpet's
 #: (0.24 px of both coordinates together; one corner in a hundred is 1.6 px off).
 BOARD_SIGMA_PX, CARPET_SIGMA_PX = 0.35, 0.20
+#: Of the board's recording [s].
+_BOARD_S = 40.0
 #: The marker that the carpet's map starts with lies on the floor, face up.
 CARPET_ORIGIN = 40
 #: Frames to either side that a pose of the carpet's reference is smoothed over.
@@ -41,6 +43,8 @@ _NEIGHBOURS = 4
 _FEWEST_MARKERS = 6
 #: Re-projection error [px] beyond which a frame's pose starts from its own markers, not from the last frame's pose.
 _LOST_PX = 2.0
+#: Folders of maps by the hash of the corners that they are made of.
+_KEPT = (Path(__file__).with_name('carpet_maps'), Path(tempfile.gettempdir()) / 'thermal_fiducial_carpet_maps')
 #: One frame in so many estimates lens and board: 50 of them.
 _OF_LENS = 16
 
@@ -51,7 +55,7 @@ def folder(name) -> Path:
 
 
 @cache
-def april_board(camera='cam0', sigma_px=BOARD_SIGMA_PX, seconds=40.0, every=1) -> CornerFlight:
+def april_board(camera='cam0', sigma_px=BOARD_SIGMA_PX, seconds=_BOARD_S, every=1) -> CornerFlight:
     """Forty seconds before the board, or the first of them, through ``cam0`` or ``cam1``: ``every`` so many frames."""
     place = folder('april_board')
     rig = yaml.safe_load((place / 'rig.yaml').read_text())
@@ -82,16 +86,17 @@ def board_reference(camera) -> tuple[np.ndarray, np.ndarray]:
     The published reference shares lens and board with the poses from the markers, and so their largest error. Where the
     camera sits on the body is taken from it in the mean, as the published extrinsics belong to the published lens.
     """
-    flight = april_board(camera)
+    # Of its frames only the corners are needed, not the poses of each marker, which take longer than all the rest.
+    flight, frames = april_board(camera, seconds=0.0), dict(_corners(folder('april_board') / f'{camera}.csv', _BOARD_S))
     place = {key: 4 * index + np.arange(4) for index, key in enumerate(sorted(flight.marker_map.markers))}
     known = [flight.marker_map.markers[key] for key in place]
     squares = corners_in_map(np.stack([m.T_map_marker for m in known]), np.array([m.size for m in known]))
-    seen = [np.concatenate([place[int(key)] for key in rows['id']]) for rows in flight.frames.values()]
-    views = self_calibration.Views(seen, [corners_px(rows).reshape(-1, 2) for rows in flight.frames.values()])
+    seen = [np.concatenate([place[int(key)] for key in ids]) for ids, _ in frames.values()]
+    views = self_calibration.Views(seen, [corners.reshape(-1, 2) for _, corners in frames.values()])
     published = self_calibration.Lens(flight.camera.K, flight.camera.D)
     some = self_calibration.Views(views.points[::_OF_LENS], views.pixels[::_OF_LENS])
     lens, board = self_calibration.calibrate(some, published, squares.reshape(-1, 3))
-    stamps = np.array(list(flight.frames)) + round(1e9 * flight.time_offset)
+    stamps = np.array(list(frames)) + round(1e9 * flight.time_offset)
     T_map_camera = self_calibration.camera_poses(views, lens, board)
     inside = (stamps >= flight.reference_ns[0]) & (stamps <= flight.reference_ns[-1])
     mounted = inverse(flight.truth(stamps[inside])) @ T_map_camera[inside]
@@ -123,18 +128,18 @@ def carpet(name, sigma_px=CARPET_SIGMA_PX, seconds=np.inf) -> CornerFlight:
 def batch_map(name, sigma_px=CARPET_SIGMA_PX) -> MarkerMap:
     """The carpet's map by an adjustment of all corners of a flight that shares nothing with ours, taken for exact.
 
-    It takes a minute, and is kept among the temporary files.
+    It takes 15 s. Those that all tests need are kept beside this file, others among the temporary files.
     """
     detections = (folder(name) / 'detections.csv').read_bytes()
-    kept = (
-        Path(tempfile.gettempdir()) / f'thermal_fiducial_{hashlib.sha256(detections).hexdigest()[:16]}_{sigma_px}.yaml'
-    )
+    places = [place / f'{hashlib.sha256(detections).hexdigest()[:16]}_{sigma_px}.yaml' for place in _KEPT]
+    kept = next((place for place in places if place.exists()), places[-1])
     if not kept.exists():
-        save_map(kept, _adjusted_map(name, sigma_px))
+        kept.parent.mkdir(exist_ok=True)
+        save_map(kept, adjusted_map(name, sigma_px))
     return load_map(kept)
 
 
-def _adjusted_map(name, sigma_px):
+def adjusted_map(name, sigma_px=CARPET_SIGMA_PX) -> MarkerMap:
     """The better of two, from two starts: from one of them a marker of `carpet_slow_circle` stays turned by 77 deg."""
     place = folder(name)
     rig = yaml.safe_load((place / 'rig.yaml').read_text())
@@ -228,13 +233,16 @@ def _samples(path, seconds=np.inf):
 
 
 def _frames(path, size, lens, sigma_px, seconds=np.inf, every=1):
-    stamps, values = _table(path, seconds)
     frames = {}
+    for stamp, (ids, corners) in _corners(path, seconds, every):
+        covariances = np.broadcast_to(sigma_px**2 * np.eye(2), (len(ids), 4, 2, 2))
+        frames[stamp] = rows_from_corners(ids, corners, covariances, np.full(len(ids), size), lens)
+    return frames
+
+
+def _corners(path, seconds=np.inf, every=1):
+    """Stamp [ns], and IDs (N,) with corners (N, 4, 2) [px], of ``every`` so many frames."""
+    stamps, values = _table(path, seconds)
     for stamp in np.unique(stamps)[::every]:
         rows = values[stamps == stamp]
-        covariances = np.broadcast_to(sigma_px**2 * np.eye(2), (len(rows), 4, 2, 2))
-        corners = rows[:, 1:9].reshape(-1, 4, 2)
-        frames[int(stamp)] = rows_from_corners(
-            rows[:, 0].astype(np.int64), corners, covariances, np.full(len(rows), size), lens
-        )
-    return frames
+        yield int(stamp), (rows[:, 0].astype(np.int64), rows[:, 1:9].reshape(-1, 4, 2))
