@@ -15,8 +15,10 @@ from thermal_fiducial.errors import InputError
 
 COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 
-# Steps of Newton's method with a numerical Jacobian: four leave 1e-11 px at the border of the worst lens.
+# Steps of Newton's method with a numerical Jacobian at most: four leave 1e-11 px at the border of the worst lens. What
+# is left in units of the focal length once another step would not help: ten times the rounding of the lens's terms.
 _STEPS = 6
+_CONVERGED = 1e-14
 _DIFFERENCE = 1e-6
 
 
@@ -66,6 +68,8 @@ class Lens:
         x = self._start(target)
         for _ in range(_STEPS):
             residual = self._bend(x) - target
+            if np.abs(residual).max(initial=0.0) < _CONVERGED:
+                break
             x = x - np.sum(_inverse(_derivative(self._bend, x)) * residual[..., None, :], axis=-1)
         return x
 
