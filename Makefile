@@ -109,6 +109,10 @@ ablation: $(READY)
 	$(BIN)/python test/mapper_ablation.py
 	$(BIN)/python test/filter_ablation.py
 
+# All that the others install, for runs in parallel: none may find half of it.
+.PHONY: ready
+ready: $(READY) $(DOCS)
+
 docs: $(DOCS)
 	@echo '== Documentation: build/site/index.html'
 	$(BIN)/python -m mkdocs build --strict --quiet
