@@ -12,6 +12,6 @@ TINY = Scenario(
     'a test flight',
     (Marker(5, (2.0, 0.0, 0.7), 180.0, 5.0, 8.0), Marker(7, (2.6, -0.5, 0.8), 170.0, 0.0, 0.0, 0.25)),
     lens=LENS,
-    flight=Flight(ground_time=0.3, climb_time=0.4, hover_time=0.2, height=0.3),
+    flight=Flight(ground_time=0.3, climb_time=0.5, hover_time=0.15, height=0.1),
     seconds=2.5,
 )

@@ -137,7 +137,7 @@ class Flight:
         Raises
         ------
         InputError
-            Too short a time to take off and land.
+            Too short a time to take off and land, or a climb that no rotors can end.
         """
         margin = self.ground_time + self.climb_time + self.hover_time
         if seconds < 2 * margin:
@@ -170,6 +170,9 @@ def _hover_attitude(t: FloatArray, positions: FloatArray, yaw: FloatArray) -> Ro
     """Attitude of a multirotor: thrust along acceleration minus gravity, heading ``yaw``."""
     acceleration = make_interp_spline(t, positions, k=_DEGREE)(t, 2)
     up = acceleration + np.array([0.0, 0.0, GRAVITY])
+    # Rotors only push: to be slower than in free fall it would have to turn over.
+    if np.min(up[:, 2]) <= 0.0:
+        raise InputError('the flight falls faster than gravity pulls: a longer climb or less height is needed')
     up /= np.linalg.norm(up, axis=1, keepdims=True)
     heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(yaw)], axis=1)
     left = np.cross(up, heading)

@@ -80,6 +80,13 @@ def test_too_short_a_flight_is_refused():
         SCENARIOS['wall'].trajectory(5.0, 0)
 
 
+def test_a_flight_that_rotors_cannot_fly_is_refused():
+    # A step of seventh degree brakes with 7.5 h / t^2: 13 m/s^2 is more than gravity does, 7.5 m/s^2 less.
+    with pytest.raises(InputError, match='falls faster than gravity'):
+        Flight(height=0.7, climb_time=0.63).trajectory(12.0, 0)
+    Flight(height=0.7, climb_time=0.84).trajectory(12.0, 0)
+
+
 def test_follows_recorded_poses(tmp_path):
     t = np.arange(0.0, 6.0, 0.02)
     positions = np.stack([np.sin(t), 0.5 * np.cos(t), 1.0 + 0.1 * t], axis=1)
