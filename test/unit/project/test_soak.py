@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ pytest.importorskip('psutil')
 
 from soak.flying import soak
 from soak.laps import lap, Laps, Repeated
-from soak.minutes import faults, Minute, node_processes
+from soak.minutes import faults, Meter, Minute, node_processes
 from support.tiny import TINY
 
 from thermal_fiducial.errors import InputError
@@ -71,6 +72,29 @@ def minutes(memory, errors, poses=12_000):
 )
 def test_growth_trends_and_missing_poses_are_named(flown, expected):
     assert faults(flown, 12_000 * len(flown), []) == expected
+
+
+class Swinging:
+    """A process that holds 100 MB, ten more for each minute that it runs, and 14 MB for seconds now and then."""
+
+    pid, now = os.getpid(), 0
+
+    def memory_info(self):
+        kept = 100 + 10 * (self.now // 60)
+        return SimpleNamespace(rss=2**20 * (kept + 14 * (self.now % 20 in (0, 1, 7))))
+
+    @staticmethod
+    def cpu_times():
+        return 1.0, 1.0
+
+
+def test_memory_is_what_is_kept_not_what_an_instant_has():
+    process, rows = Swinging(), []
+    meter = Meter(SimpleNamespace(take=lambda: np.zeros(0)), lambda: {'node': process}, rows.append)
+    for process.now in range(181):
+        meter(process.now * 1_000_000_000)
+    assert [minute.memory_mb for minute in meter.minutes] == [{'node': 100}, {'node': 110}, {'node': 120}]
+    assert len(rows) == 3
 
 
 def test_a_process_that_has_ended_is_no_node():
