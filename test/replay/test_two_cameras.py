@@ -47,9 +47,14 @@ def two_cameras(folder):
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp('two')
-    two_cameras(folder).write(folder / 'bag')
-    return folder
+    return tmp_path_factory.mktemp('two')
+
+
+@pytest.fixture(scope='module')
+def recording(folder):
+    recording = two_cameras(folder)
+    recording.write(folder / 'bag')
+    return recording
 
 
 def replay(folder, bag, run, *extra):
@@ -58,7 +63,7 @@ def replay(folder, bag, run, *extra):
 
 
 @pytest.fixture(scope='module')
-def run(folder):
+def run(folder, recording):
     assert replay(folder, folder / 'bag', 'both', '--second-camera', 'down') == 0
     return folder / 'both'
 
@@ -95,9 +100,8 @@ def test_each_camera_has_its_own_parameters(run):
     assert first['marker_size'] == second['marker_size'] == small_bag.SIZE
 
 
-def test_the_run_can_be_replayed_from_its_markers(run, folder, tmp_path):
+def test_the_run_can_be_replayed_from_its_markers(run, folder, recording, tmp_path):
     """Both cameras' markers are in the output; calibrations and IMU are those of the bag."""
-    recording = two_cameras(tmp_path)
     markers = small_bag.Recording([event for event in recording.events if not event[1].endswith(IMAGE_TOPIC)])
     with BagReader(run / 'output') as output:
         for message in output.messages(['markers', 'down/markers']):
@@ -108,12 +112,14 @@ def test_the_run_can_be_replayed_from_its_markers(run, folder, tmp_path):
     assert (folder / 'of_markers' / 'fiducial.tum').read_bytes() == (run / 'fiducial.tum').read_bytes()
 
 
+@pytest.mark.usefixtures('recording')
 def test_a_second_camera_that_the_bag_lacks_is_refused(folder, capsys):
     assert replay(folder, folder / 'bag', 'up', '--second-camera', 'up') == 2
     assert f'no topic up/{IMAGE_TOPIC}' in capsys.readouterr().err
 
 
 @pytest.mark.nightly
+@pytest.mark.usefixtures('recording')
 def test_processes_play_both(folder):
     assert replay(folder, folder / 'bag', 'processes', '--second-camera', 'down', '--transport', 'processes') == 0
     summary = json.loads((folder / 'processes' / 'summary.json').read_text())
