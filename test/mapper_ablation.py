@@ -8,11 +8,14 @@ arguments: only these. Recordings are taken where ``THERMAL_FIDUCIAL_DATA`` name
 from dataclasses import dataclass
 from functools import cache
 import sys
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from support.mapper_scenes import Figures, SCENES
 from support.taken_out import ablation_row, lines_of
+
+from thermal_fiducial.core.error_model import map_of_pose, scale_of_map
 
 MAPPING = 'thermal_fiducial.core.mapping'
 #: Change of a figure that is worth printing.
@@ -42,6 +45,13 @@ class Mechanism:
 
 def _ignored(*_: Any, **__: Any) -> None:
     return None
+
+
+def _bounded(self: Any, gains: Any, camera_position: Any) -> Any:
+    """A pose's error by the map whose markers' errors are correlated in any way."""
+    sight = self.sight
+    rest = sight.map_covariances - scale_of_map(sight.scale_arms, self.model)
+    return map_of_pose(gains, rest, sight.T_map_marker[:, :3, 3], camera_position)
 
 
 MECHANISMS = {
@@ -88,8 +98,18 @@ MECHANISMS = {
     ),
     'shape of markers': Mechanism(
         ('shaped markers', 'wall', 'chain'),
-        ('bundle_adjustment:_shape_covariances',),
-        {'bundle_adjustment:_shape_covariances': lambda problem, *_: np.zeros((len(problem.ids), 6, 6))},
+        ('error_sources:ErrorSources._shapes',),
+        {'error_sources:ErrorSources._shapes': lambda self, _: np.zeros(len(self.problem.ids))},
+    ),
+    'lens in the errors of the map': Mechanism(
+        ('bent corridor', 'wall'),
+        ('error_sources:LensErrors',),
+        {'error_sources:LensErrors': lambda *_: SimpleNamespace(drawn=lambda chosen: 0.0)},
+    ),
+    'joint draws of the map': Mechanism(
+        ('bent corridor', 'wall'),
+        ('localization:_JointFit._of_map', 'error_sources:ErrorSources.noise'),
+        {'localization:_JointFit._of_map': _bounded},
     ),
     'priors': Mechanism(
         ('second flight', 'chain'), ('keyframes:prior_poses',), {'keyframes:prior_poses': lambda *_: {}}

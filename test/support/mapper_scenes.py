@@ -12,6 +12,7 @@ import numpy as np
 from support import real_flights, tagslam, walls
 from support.corner_runs import rms
 from support.scenes import motion_prior
+from support.wrong_lenses import bent_corridor
 from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, retract
@@ -348,12 +349,19 @@ def _recorded_tags(name: str) -> Callable[[], Figures]:
     return scene
 
 
+def bent() -> Figures:
+    """A corridor behind a lens that is off by 0.1 px, mean of two."""
+    off, of_map, of_poses = np.mean([bent_corridor(seed, 0.1, 600) for seed in range(2)], axis=0).tolist()
+    return {'map mm': 1e3 * off, 'map NEES': of_map, 'pose NEES': of_poses}
+
+
 SCENES: dict[str, Callable[[], Figures]] = {
     'wall': wall,
     'shaped markers': lambda: wall(0.07),
     'wrong lens': wrong_lens,
     'small markers': small_markers,
     'chain': chain,
+    'bent corridor': bent,
     'moved markers': moved_marker,
     'uneven map': uneven_map,
     'second flight': second_flight,

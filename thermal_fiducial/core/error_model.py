@@ -63,6 +63,10 @@ INCONSISTENT_PX = 0.3
 WHITE_PX = 0.5
 
 
+#: Joint draws of the errors of a map: standard deviations by 64 are accurate to a tenth, those by the lens exact.
+DRAWS = 64
+
+
 # Poses from the corners of a frame.
 
 
@@ -135,6 +139,21 @@ def map_of_pose(
     A = lever_arm(arms)
     common = MAP_COMMON * A @ positive(covariances[best]) @ np.swapaxes(A, -1, -2)
     return np.asarray(common[-1] + correlated_sum(gains, positive(covariances - common[:-1])))
+
+
+def of_draws(gains: FloatArray, draws: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a camera pose by joint ``draws`` (N, 6, K) of the errors of N markers.
+
+    Parameters
+    ----------
+    gains : (N, 6, 6) derivative of the pose by the pose of each marker
+    """
+    return covariance_of(np.tensordot(gains, draws, axes=([0, 2], [0, 1])))
+
+
+def covariance_of(draws: FloatArray) -> FloatArray:
+    """Covariances (..., m, m) of draws (..., m, K) of errors whose mean is zero."""
+    return np.asarray(draws @ np.swapaxes(draws, -1, -2) / draws.shape[-1])
 
 
 def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
@@ -240,7 +259,11 @@ def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:
     gains : (n, m, 6)
     covariances : (n, 6, 6)
     """
-    terms = gains @ covariances @ np.swapaxes(gains, -1, -2)
+    return bounded_sum(gains @ covariances @ np.swapaxes(gains, -1, -2))
+
+
+def bounded_sum(terms: FloatArray) -> FloatArray:
+    """Upper bound (m, m) of the covariance of a sum for any correlations of its terms; covariances (n, m, m)."""
     # Rotations and metres are made comparable by the terms' own mean variances.
     variances = np.diagonal(terms, axis1=-2, axis2=-1)
     total = np.sum(variances, axis=0)

@@ -13,17 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import (
-    arms_of_scale,
-    noise_factor,
-    scale_of_map,
-    shape_of_corners,
-    SystematicErrors,
-)
+from thermal_fiducial.core.error_model import arms_of_scale, covariance_of, noise_factor, scale_of_map
 from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Snapshot
+from thermal_fiducial.core.mapping.error_sources import ErrorSources
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
 MAX_ITERATIONS = 25
@@ -32,10 +26,6 @@ MAX_ITERATIONS = 25
 _CONVERGED = 0.1
 # Median of chi square of eight degrees of freedom.
 _MEDIAN_CHI2 = 7.34
-# Samples of systematic errors: standard deviations are then accurate to a fifth.
-_SAMPLES = 32
-# Samples that are propagated at a time, which bounds the memory.
-_AT_ONCE = 8
 # A marker is at two places if it has this many outlying views at least, and this share of all, and another pose
 # explains this share of their squared error. Six parameters explain 0.08 of ten views of noise, and 0.5 of motion blur
 # over some frames.
@@ -102,9 +92,13 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
     system = problem.equations.reduced(problem.normal(now, scale)[0])
     if system is None:
         return None
-    covariances = system.covariances(widened, np.stack([snapshot.markers[key].covariance for key in problem.ids]))
+    of_held = np.stack([snapshot.markers[key].covariance for key in problem.ids])
+    covariances = system.covariances(widened, of_held)
     positions = now.state.T_map_marker[:, :3, 3]
-    covariances += _shape_covariances(problem, system, now, weights, snapshot.errors)
+    sources = ErrorSources(problem, system, now, weights, np.random.default_rng(0))
+    lasting = sources.lasting(snapshot.errors)
+    covariances += covariance_of(lasting)
+    draws = lasting + sources.noise(widened, of_held)
     covariances += scale_of_map(arms_of_scale(positions, positions[problem.held]), snapshot.errors)
     if not np.all(np.isfinite(covariances)):
         return None
@@ -114,7 +108,12 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
     views = {key: problem.marker == i for i, key in free}
     return AdjustedMap(
         {
-            key: replace(snapshot.markers[key], T_map_marker=now.state.T_map_marker[i], covariance=covariances[i])
+            key: replace(
+                snapshot.markers[key],
+                T_map_marker=now.state.T_map_marker[i],
+                covariance=covariances[i],
+                draws=draws[i],
+            )
             for i, key in free
         },
         dict(zip(problem.stamps, now.state.T_map_camera, strict=True)),
@@ -124,32 +123,6 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
         {key: outliers[key] for key, own in views.items() if two_places(*now.of_views(own), ~full[own])},
         snapshot.map_revision,
     )
-
-
-def _shape_covariances(
-    problem: MapProblem, system: ReducedSystem, now: Linearised, weights: FloatArray, errors: SystematicErrors
-) -> FloatArray:
-    """Covariances (M, 6, 6) by corner errors that are the same in all views of a marker.
-
-    They do not average out and leave no residuals: the shape of a fixed marker rotates the whole map. They are
-    propagated by samples.
-    """
-    if errors.marker_shape == 0.0:
-        return np.zeros((len(problem.ids), 6, 6))
-    precision = 0.5 * np.mean(np.sum(problem.W**2, axis=(2, 3)), axis=1)
-    views = np.bincount(problem.marker)
-    middle = np.cumsum(views) - 1 - views // 2
-    typical = 1.0 / precision[np.lexsort((precision, problem.marker))[middle]]
-    std = shape_of_corners(views / np.bincount(problem.marker, precision), typical, errors)
-    rng, covariances = np.random.default_rng(0), np.zeros((len(problem.ids), 6, 6))
-    for _ in range(_SAMPLES // _AT_ONCE):
-        samples = std[:, None, None, None] * rng.standard_normal((len(problem.ids), 4, 2, _AT_ONCE))
-        off = weights[:, None, None] * (problem.W @ samples[problem.marker]).reshape(-1, 8, _AT_ONCE)
-        of_frames = problem.over_frames(np.swapaxes(now.J_camera, -1, -2) @ off)
-        of_markers = problem.over_markers(np.swapaxes(now.J_marker, -1, -2) @ off)
-        _, steps = system.solve(of_frames, of_markers)
-        covariances += steps @ np.swapaxes(steps, -1, -2) / _SAMPLES
-    return covariances
 
 
 def two_places(residuals: FloatArray, J: FloatArray, outlying: BoolArray) -> bool:

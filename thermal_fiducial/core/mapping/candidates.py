@@ -42,6 +42,8 @@ class Placement:
     T_map_marker: FloatArray | None
     covariance: FloatArray
     reason: str = ''
+    #: (6, K) of :class:`MapMarker`
+    draws: FloatArray | None = None
 
 
 @dataclass
@@ -97,7 +99,9 @@ class Candidate:
         others = np.flatnonzero(rotation_angle(fits.T[0, :3, :3].T @ fits.T[:, :3, :3]) > SAME_POSE)
         if len(others) and fits.cost[others[0]] - fits.cost[0] < UNAMBIGUOUS * scale:
             return Placement(None, nothing, f'planar ambiguity of marker {self.id} unsettled')
-        return Placement(fits.T[0], fits.covariance(scale))
+        # The noise of each marker is its own.
+        covariance, draws = fits.errors(scale, np.random.default_rng(self.id))
+        return Placement(fits.T[0], covariance, draws=draws)
 
     def solutions(self, camera: Camera) -> list[FloatArray]:
         """All poses (4, 4) that a fit to the views ends in, the best first."""
@@ -156,7 +160,8 @@ class NewMarkers:
             placement = candidate.place(camera)
             candidate.reason = placement.reason
             if placement.T_map_marker is not None:
-                placed.append(entry(stamp_ns, candidate, placement.T_map_marker, placement.covariance))
+                marker = entry(stamp_ns, candidate, placement.T_map_marker, placement.covariance)
+                placed.append(replace(marker, draws=placement.draws))
                 del self.candidates[candidate.id]
         while len(self.candidates) > MOST:
             del self.candidates[min(self.candidates, key=lambda key: self.candidates[key].views[-1].stamp_ns)]

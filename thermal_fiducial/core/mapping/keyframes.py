@@ -204,7 +204,8 @@ class KeyframeStore:
         frames = self._selected(views)
         number = sum(len(frame.ids) for frame in frames)
         self._adjustment = LastAdjustment(next(reversed(self.frames)), len(self.frames), number, markers, self._added)
-        trusted = {key: marker for key, marker in marker_map.markers.items() if marker.trusted}
+        # Without draws, which are made anew: the input goes to another process.
+        trusted = {key: replace(m, draws=None) for key, m in marker_map.markers.items() if m.trusted}
         return snapshot_of(trusted, frames, self._priors, marker_map.revision, errors)
 
     def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:

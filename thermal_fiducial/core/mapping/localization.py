@@ -10,14 +10,18 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.error_model import (
+    bounded_sum,
     corner_correlations,
     corners_of_pose,
+    correlated_sum,
     decision_weights,
     map_of_pose,
     map_weights,
     noise_factor,
     noise_of_pose,
+    of_draws,
     of_single_error,
+    positive,
     scale_of_map,
     SystematicErrors,
 )
@@ -84,9 +88,8 @@ def _either(frame: '_JointFit', found: Location, T_other: FloatArray, prior: Flo
     if other is None:
         return found
     if prior is None:
-        covariances = np.stack([pose.covariance, other.pose.covariance])
-        viewpoint = Viewpoint(np.stack([T, T_other]), covariances, np.zeros((6, 6)))
-        return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', viewpoint)
+        both = Viewpoint.either(found.viewpoint, other.viewpoint)
+        return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both)
     turns = rotation_angle(prior[:3, :3].T @ np.stack([T, T_other])[:, :3, :3])
     return other if turns[1] < turns[0] else found
 
@@ -152,17 +155,33 @@ class _JointFit:
         of_scale = np.einsum('nij,nj->i', map_gains[:, :, :3], sight.scale_arms) - grown
         # A longer focal length moves all corners away from the principal point.
         of_focal = gains @ (sight.observed.corners - self.camera.principal_point).ravel()
-        of_map = of_single_error(of_scale, model.marker_size_std) + of_single_error(of_focal, model.focal_length_std)
+        scales = of_single_error(of_scale, model.marker_size_std) + of_single_error(of_focal, model.focal_length_std)
+        of_map = scales
         if np.any(sight.map_covariances):
-            rest = sight.map_covariances - scale_of_map(sight.scale_arms, model)
-            of_map += map_of_pose(map_gains, rest, sight.T_map_marker[:, :3, 3], T_map_camera[:3, 3])
+            of_map = scales + self._of_map(map_gains, T_map_camera[:3, 3])
         covariance = white + of_corners + of_map
         if not np.all(np.isfinite(covariance)):
             return None
         ids, rms_px = tuple(sight.observed.ids.tolist()), math.sqrt(seen.errors_px @ seen.errors_px / n)
         T = retract(T_map_camera, step)
         pose = CameraPose(self.stamp_ns, T, covariance, of_map, ids, rms_px)
-        return Location(pose, sight, seen, weights, map_gains, correlations, white)
+        return Location(
+            pose, sight, seen, weights, map_gains, correlations, white, scales, by_corner, self.camera, model
+        )
+
+    def _of_map(self, gains: FloatArray, camera_position: FloatArray) -> FloatArray:
+        """Covariance (6, 6) of a camera pose by errors of the map, without its scale.
+
+        By joint draws, where the markers have them; how the errors of the others are correlated is not known.
+        """
+        sight, others = self.sight, ~self.sight.drawn
+        joint = of_draws(gains, sight.draws)
+        if not others.any():
+            return joint
+        rest = sight.map_covariances - scale_of_map(sight.scale_arms, self.model)
+        if not sight.draws.any():
+            return map_of_pose(gains, rest, sight.T_map_marker[:, :3, 3], camera_position)
+        return bounded_sum(np.stack([joint, correlated_sum(gains[others], positive(rest[others]))]))
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
         """The second solution (4, 4) of the planar ambiguity if the corners do not rule it out, else None."""

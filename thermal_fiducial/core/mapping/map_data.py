@@ -45,6 +45,9 @@ class MapMarker:
     last_seen_ns: int = 0
     #: False: in quarantine as inconsistent; no pose uses it
     trusted: bool = True
+    #: (6, K) draws of its error, jointly with those of the markers of the same adjustment; None: how it is correlated
+    #: with others is not known. A file has none.
+    draws: FloatArray | None = field(default=None, compare=False, repr=False)
 
     def seen(self, stamp_ns: int, error_px: float) -> 'MapMarker':
         """The marker after one more observation; without ``replace``, as this runs for every marker of every frame."""
@@ -54,7 +57,7 @@ class MapMarker:
         first = self.first_seen_ns if self.observations else stamp_ns
         return MapMarker(
             self.id, self.size, self.fixed, self.T_map_marker, self.covariance,
-            math.sqrt(mean_square), count, first, stamp_ns, self.trusted,
+            math.sqrt(mean_square), count, first, stamp_ns, self.trusted, self.draws,
         )  # fmt: skip
 
 
@@ -87,7 +90,9 @@ class MarkerMap:
         for marker_id, marker in adjusted.items():
             own = self.markers.get(marker_id)
             if own is not None and own.trusted:
-                self.markers[marker_id] = replace(own, T_map_marker=marker.T_map_marker, covariance=marker.covariance)
+                self.markers[marker_id] = replace(
+                    own, T_map_marker=marker.T_map_marker, covariance=marker.covariance, draws=marker.draws
+                )
         self.revision += 1
 
     def geometry(self) -> dict[int, tuple[FloatArray, float]]:

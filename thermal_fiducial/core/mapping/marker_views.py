@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import correlated_sum, SystematicErrors, with_corner_errors
+from thermal_fiducial.core.error_model import correlated_sum, covariance_of, DRAWS, SystematicErrors, with_corner_errors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import linearise
 from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
@@ -29,6 +29,9 @@ class Viewpoint:
     covariances: FloatArray
     #: (6, 6) error that all views share (of odometry over a gap): it moves the marker, but leaves no residual
     common: FloatArray
+    #: (2, 6, K) joint draws of a further such error of either, with which the rest is noise; None: correlations are not
+    #: known
+    draws: FloatArray | None = None
 
     @property
     def poses(self) -> FloatArray:
@@ -36,9 +39,21 @@ class Viewpoint:
         return self.T_map_camera if np.any(self.T_map_camera[0] != self.T_map_camera[1]) else self.T_map_camera[:1]
 
     @classmethod
-    def known(cls, T_map_camera: FloatArray, covariance: FloatArray, common: FloatArray) -> 'Viewpoint':
+    def known(
+        cls, T_map_camera: FloatArray, covariance: FloatArray, common: FloatArray, draws: FloatArray | None = None
+    ) -> 'Viewpoint':
         """A unique camera pose (4, 4); covariances (6, 6) of its independent and of its common error."""
-        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2), common)
+        both = None if draws is None else np.broadcast_to(draws, (2, *draws.shape))
+        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2), common, both)
+
+    @classmethod
+    def either(cls, first: 'Viewpoint', second: 'Viewpoint') -> 'Viewpoint':
+        """One of two known camera poses."""
+        views = (first, second)
+        T, covariances = np.stack([v.T_map_camera[0] for v in views]), np.stack([v.covariances[0] for v in views])
+        if first.draws is None or second.draws is None:
+            return cls(T, covariances + np.stack([v.common for v in views]), np.zeros((6, 6)))
+        return cls(T, covariances, first.common, np.stack([first.draws[0], second.draws[0]]))
 
 
 @dataclass(frozen=True)
@@ -67,16 +82,24 @@ class FittedPoses:
     #: (n, 8, 6) derivatives of the best one's whitened residuals by the poses of camera and marker
     J_camera: FloatArray
     J_marker: FloatArray
-    #: (n, 6, 6) of its cameras, and the part that they share
+    #: (n, 6, 6) of its cameras, and the part that they share; (n, 6, K) joint draws of what they share besides
     camera_covariances: FloatArray
     common: FloatArray
+    draws: FloatArray | None
 
-    def covariance(self, noise: float) -> FloatArray:
-        """(6, 6) of the best fit: the corners' covariance times ``noise``, and the errors of the cameras' poses."""
+    def errors(self, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray | None]:
+        """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error where the cameras' errors have some.
+
+        The errors are the corners', whose covariance counts ``noise`` times, and those of the cameras' poses.
+        """
         white = np.linalg.inv(np.einsum('vri,vrj->ij', self.J_marker, self.J_marker))
         gains = -white @ np.einsum('vri,vrj->vij', self.J_marker, self.J_camera)
-        from_cameras = correlated_sum(gains, self.camera_covariances) + correlated_sum(gains, self.common)
-        return np.asarray(noise * white + from_cameras)
+        own = noise * white + correlated_sum(gains, self.common)
+        if self.draws is None:
+            return own + correlated_sum(gains, self.camera_covariances), None
+        shared = np.tensordot(gains, self.draws, axes=([0, 2], [0, 1]))
+        of_noise = np.linalg.cholesky(noise * white) @ rng.standard_normal((6, DRAWS))
+        return own + covariance_of(shared), shared + of_noise
 
 
 @dataclass(frozen=True)
@@ -101,6 +124,15 @@ class MarkerViews:
         self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
         self._covariances = np.stack([view.viewpoint.covariances for view in views])
         self._common = np.stack([view.viewpoint.common for view in views])
+        draws = [view.viewpoint.draws for view in views if view.viewpoint.draws is not None]
+        self._draws = np.stack(draws) if len(draws) == len(views) else None
+        if self._draws is not None:
+            # Views whose cameras have a larger error in common than others count less.
+            best = np.argmin(np.sum(np.square(self._draws[:, 0]), axis=(1, 2)))
+            self._covariances = self._covariances + covariance_of(self._draws - self._draws[best, 0])
+        elif draws:
+            unknown = [np.zeros((2, 6, 1)) if v.viewpoint.draws is None else v.viewpoint.draws for v in views]
+            self._common = self._common + np.stack([covariance_of(both)[0] for both in unknown])
         self._doubtful = any(len(view.viewpoint.poses) > 1 for view in views)
 
     def fit(self, starts: FloatArray) -> FittedPoses:
@@ -120,6 +152,7 @@ class MarkerViews:
         return FittedPoses(
             T[order], chi2[order], cost[order],
             W @ J_camera[best], W @ J_marker[best], covariances[best], self._common,
+            None if self._draws is None else self._draws[np.arange(len(used[best])), used[best]],
         )  # fmt: skip
 
     def _choose(self, T: FloatArray) -> IntArray:

@@ -111,6 +111,14 @@ class ReducedSystem:
                 result[free] += gains @ held_covariances[held] @ np.swapaxes(gains, -1, -2)
         return np.asarray(0.5 * (result + np.swapaxes(result, -1, -2)))
 
+    def by_held(self, drawn: FloatArray) -> FloatArray:
+        """Errors (M, 6, K) of all markers by those of the held ones, of ``drawn`` (M, 6, K)."""
+        free, result = ~self.held, np.where(self.held[:, None, None], drawn, 0.0)
+        if result.any():
+            moved = (self.matrix @ result.reshape(-1, result.shape[-1])).reshape(result.shape)
+            result[free] = -self.factor.solve(moved[free].reshape(-1, result.shape[-1])).reshape(result[free].shape)
+        return np.asarray(result)
+
 
 def _damped(H: FloatArray, damping: float) -> FloatArray:
     """Marquardt damping of (..., 6, 6); a little of it always, so that no block is singular."""

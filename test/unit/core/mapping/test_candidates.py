@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from support.small_bag import CAMERA as STRAIGHT
 
+from thermal_fiducial.core.error_model import covariance_of, DRAWS
 from thermal_fiducial.core.geometry.reprojection import marker_corners
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.candidates import Candidate
 from thermal_fiducial.core.mapping.marker_views import MarkerView, Viewpoint
 
@@ -37,3 +38,47 @@ def test_a_start_through_a_camera_is_no_marker(gap):
     placement = candidate.place(CAMERA)
     assert placement.T_map_marker is None
     assert 'marker 7' in placement.reason
+
+
+def seen_from(x, draws):
+    """The marker seen without error by a camera ``x`` beside the middle, whose pose has joint ``draws`` of errors."""
+    T_map_camera = transform(np.eye(3), [x, 0.2, 0.0])
+    branch = inverse(T_map_camera) @ T_MAP_MARKER
+    corners = CAMERA.project((branch[:3, :3] @ marker_corners(SIZE).T).T + branch[:3, 3])
+    viewpoint = Viewpoint.known(T_map_camera, 1e-8 * np.eye(6), np.zeros((6, 6)), draws)
+    return MarkerView(
+        round(1e9 * (1.0 + x)), viewpoint, corners, np.tile(1e-4 * np.eye(2), (4, 1, 1)), np.stack([branch] * 2)
+    )
+
+
+def placed(*draws):
+    candidate = Candidate(7, SIZE)
+    for x, own in zip((-0.3, 0.0, 0.3), draws, strict=True):
+        candidate.add(seen_from(x, own))
+    return candidate.place(CAMERA)
+
+
+def test_a_new_marker_has_the_errors_of_the_cameras_draw_by_draw():
+    shift = np.zeros((6, DRAWS))
+    shift[:3] = 0.1 * np.random.default_rng(0).normal(size=(3, DRAWS))
+    known, shared = placed(*[np.zeros((6, DRAWS))] * 3), placed(*[shift] * 3)
+    # Cameras that are shifted alike shift the marker by as much.
+    assert np.allclose(shared.draws - known.draws, shift, rtol=0.0, atol=1e-9)
+    assert np.allclose(shared.covariance - known.covariance, covariance_of(shift), rtol=0.0, atol=1e-9)
+
+
+def test_where_one_view_has_no_draws_the_errors_count_as_correlated_anyhow():
+    shift = np.zeros((6, DRAWS))
+    shift[:3] = 0.1 * np.random.default_rng(0).normal(size=(3, DRAWS))
+    mixed = placed(shift, shift, None)
+    assert mixed.draws is None
+    # Two of three views that count alike have 4/9 of the variance if their errors are the same, and 2/9 if independent.
+    assert mixed.covariance[:3, :3].trace() > 0.35 * covariance_of(shift)[:3, :3].trace()
+
+
+def test_one_of_two_cameras_has_the_draws_of_each():
+    first, second = (seen_from(x, x * np.ones((6, DRAWS))).viewpoint for x in (0.1, 0.2))
+    both = Viewpoint.either(first, second)
+    assert len(both.poses) == 2
+    assert np.array_equal(both.draws[:, 0, 0], [0.1, 0.2])
+    assert Viewpoint.either(first, replace(second, draws=None)).draws is None

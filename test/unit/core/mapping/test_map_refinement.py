@@ -6,8 +6,9 @@ import pickle
 import numpy as np
 import pytest
 from support.walls import CAMERA, flight, see, SIZE, wall
+from support.wrong_lenses import drawn_lens
 
-from thermal_fiducial.core.error_model import NO_SYSTEMATIC_ERRORS, SystematicErrors
+from thermal_fiducial.core.error_model import covariance_of, NO_SYSTEMATIC_ERRORS, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
@@ -293,9 +294,39 @@ def test_errors_that_last_are_in_the_covariances():
         frames = tuple(replace(frame, corners=frame.corners + off[frame.ids]) for frame in exact.keyframes)
         d = errors(refine(replace(exact, keyframes=frames)), poses)
         nees.append(np.mean(np.einsum('ni,nij,nj->n', d, np.linalg.inv(P), d)))
-    # Six, or 32 / 25 times that (the mean of an inverted Wishart matrix of 32 samples). A map's markers share most
+    # Six, or 64 / 57 times that (the mean of an inverted Wishart matrix of 64 samples). A map's markers share most
     # of their error: the mean of twenty has a standard deviation of 0.9.
-    assert 6.0 - 2.7 < np.mean(nees) < 6.0 * 32 / 25 + 2.7
+    assert 6.0 - 2.7 < np.mean(nees) < 6.0 * 64 / 57 + 2.7
+
+
+def test_a_lens_that_is_wrong_is_in_the_covariances():
+    poses, nees = wall(np.random.default_rng(0)), []
+    exact = snapshot(np.random.default_rng(1), poses, sigma=0.0, disturbance=0.0)
+    lens = replace(NO_SYSTEMATIC_ERRORS, corner_px=0.1)
+    white, both = (refine(replace(exact, errors=errors)).markers for errors in (NO_SYSTEMATIC_ERRORS, lens))
+    P = np.stack([both[i].covariance - white[i].covariance for i in range(1, 8)])
+    for seed in range(20):
+        off = drawn_lens(np.random.default_rng(seed), 0.1)
+        frames = tuple(replace(frame, corners=frame.corners + off(frame.corners)) for frame in exact.keyframes)
+        d = errors(refine(replace(exact, keyframes=frames)), poses)
+        nees.append(np.mean(np.einsum('ni,nij,nj->n', d, np.linalg.inv(P), d)))
+    # Six. The markers share the lens: the means of single maps scatter by 2.5, their mean by 0.6.
+    assert 6.0 - 1.8 < np.mean(nees) < 6.0 + 1.8
+
+
+def test_draws_say_how_the_errors_of_markers_are_correlated():
+    """Two markers side by side have nearly the same error: their distance is known better than the place of either."""
+    poses = wall(np.random.default_rng(0), tilt=0.0)
+    recorded = snapshot(np.random.default_rng(1), poses, sigma=0.05)
+    adjusted = refine(replace(recorded, errors=SystematicErrors(marker_size_std=0.0))).markers
+    for marker in adjusted.values():
+        variances = np.stack([marker.covariance.diagonal(), covariance_of(marker.draws).diagonal()])
+        # By 64 draws a variance is known to 18 %: beyond four standard deviations of its logarithm.
+        assert np.abs(np.diff(np.log(variances), axis=0)).max() < 4 * 0.18
+    # The markers farthest from the held one, 0, are 3 and 7 (3 m); each is 1 m from the other.
+    third, seventh = (adjusted[i].draws for i in (3, 7))
+    between, alone = (covariance_of(draws)[:3, :3].trace() for draws in (third - seventh, seventh))
+    assert between < 0.5 * alone
 
 
 def test_a_side_that_is_covered_in_all_views_is_in_the_covariance():

@@ -108,3 +108,18 @@ def test_a_system_that_is_not_positive_definite_has_no_solution(of):
     equations, blocks, _ = system(7, only(0))
     getattr(blocks, of)[3] = -np.eye(6)
     assert equations.reduced(blocks) is None
+
+
+@pytest.mark.usefixtures('way')
+@pytest.mark.parametrize('held', [only(0), only(1, 3)])
+def test_the_others_follow_the_held_markers(held):
+    equations, blocks, whole = system(4, held)
+    drawn = np.random.default_rng(5).normal(size=(MARKERS, 6, 3))
+    found = equations.reduced(blocks).by_held(drawn)
+    assert np.array_equal(found[held], drawn[held])
+    free = unknowns(held)
+    moved = np.concatenate([np.zeros((FRAMES, 6, 3)), np.where(held[:, None, None], drawn, 0.0)]).reshape(-1, 3)
+    expected = moved.copy()
+    expected[free] -= np.linalg.solve(whole[np.ix_(free, free)], (whole @ moved)[free])
+    # As for the solutions above.
+    assert np.allclose(found.reshape(-1, 3), expected[6 * FRAMES :], rtol=0.0, atol=1e-7)

@@ -1,0 +1,90 @@
+"""Lenses whose calibration is off by a smooth random function of the place in the image, and flights behind them."""
+
+import numpy as np
+
+from support import walls
+from support.scenes import motion_prior
+from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.mapping.keyframes import VIEWS
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.measurements import corners_px, Odometry
+
+#: Waves that a function is the sum of: enough for its values to be normally distributed.
+_WAVES = 200
+_SIGMA_PX = 0.05
+_CONFIG = MarkerMapperConfig(marker_size_std=0.0, focal_length_std=0.0, camera_orientation=(0.0, 0.0, 0.0, 1.0))
+
+
+def drawn_lens(rng, px, width=walls.CAMERA.width, length=0.25):
+    """Errors (..., 2) [px] of corners (..., 2), of standard deviation ``px`` over a ``length`` in image widths.
+
+    Sums of cosines have the same covariance as the errors that the package assumes, and nothing else in common with
+    its draws (A. Rahimi, B. Recht, "Random Features for Large-Scale Kernel Machines", 2007).
+    """
+    waves = rng.normal(size=(_WAVES, 2)) / (length * width)
+    phases, heights = rng.uniform(0.0, 2.0 * np.pi, (2, _WAVES)), rng.normal(size=(2, _WAVES))
+
+    def errors(corners):
+        along = corners @ waves.T
+        both = [np.cos(along + phase) @ height for phase, height in zip(phases, heights, strict=True)]
+        return px * np.sqrt(2.0 / _WAVES) * np.stack(both, axis=-1)
+
+    return errors
+
+
+def through(lens, rows, sigma):
+    """Rows of markers seen through such a lens."""
+    corners = corners_px(rows)
+    return walls.rows(rows['id'], corners + lens(corners), sigma)
+
+
+def _corridor(rng):
+    """Fifteen markers along 11 m, of which two or three are in view, and where the camera is in frame k."""
+    first = walls.wall(rng, 1)[0]
+    poses = {i: retract(first, [0.0, 0.8 * i, *(rng.normal(size=4) * [0.1, 0.05, 0.05, 0.05])]) for i in range(15)}
+
+    def camera(k):
+        y = poses[0][1, 3] + 0.3 + 10.6 * k / 600
+        eye = np.array([-1.8, y + 0.2 * np.sin(k / 9), 1.0 + 0.3 * np.sin(k / 14)])
+        return walls.look(eye, [0.0, y, 1.0 + 0.1 * np.sin(k / 20)])
+
+    return poses, camera
+
+
+def _odometry(stamp, T_map_camera, rng):
+    """A filter's, in the frame of the camera."""
+    off = rng.normal(size=6) * np.repeat([0.005, 0.001], 3)
+    P, twist = (np.diag(np.repeat(stds, 3)) ** 2 for stds in ([0.01, 0.0025], [0.03, 0.01]))
+    return motion_prior(Odometry(stamp, retract(T_map_camera, off), np.zeros(3), np.zeros(3), P, twist))
+
+
+def _nees(off, covariance):
+    return float(off @ np.linalg.solve(covariance, off)) / 6.0
+
+
+def bent_corridor(seed, lens_px, frames):
+    """A map that grows along a corridor from one marker, behind a lens that is off by ``lens_px``.
+
+    Returns
+    -------
+    Rms error of the markers [m]; NEES per degree of freedom of the map in the end, and of the poses while it grew.
+    """
+    rng = np.random.default_rng(seed)
+    lens, (poses, camera) = drawn_lens(rng, lens_px), _corridor(rng)
+    mapper = MarkerMapper(_CONFIG, MarkerMap({0: MapMarker(0, walls.SIZE, True, poses[0])}))
+    of_poses = []
+    for k in range(0, frames, 2):
+        T, stamp = camera(k), walls.stamp(k)
+        rows = through(lens, walls.see(T, poses, _SIGMA_PX, rng), _SIGMA_PX)
+        pose = mapper.process(stamp, rows, walls.CAMERA, _odometry(stamp, T, rng)).pose
+        if pose is not None and k > 60:
+            of_poses.append(_nees(difference(pose.T_map_camera, T), pose.covariance))
+        if mapper.refinement_due(stamp):
+            mapper.refine(VIEWS)
+    mapper.refine(VIEWS)
+    markers = [marker for key, marker in mapper.map.markers.items() if key]
+    of_map = [_nees(difference(m.T_map_marker, poses[m.id]), m.covariance) for m in markers]
+    off = [np.linalg.norm(difference(m.T_map_marker, poses[m.id])[:3]) for m in markers]
+    return np.sqrt(np.mean(np.square(off))), np.mean(of_map), np.mean(of_poses)

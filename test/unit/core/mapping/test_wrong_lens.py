@@ -1,0 +1,22 @@
+"""Maps that grow behind a lens whose calibration is wrong claim the error that they have."""
+
+import numpy as np
+import pytest
+from support.wrong_lenses import bent_corridor
+
+
+def check(seeds, frames):
+    of_map, of_poses = np.mean([bent_corridor(seed, 0.1, frames)[1:] for seed in range(seeds)], axis=0)
+    # One lens makes the errors of a whole flight: its NEES scatters by as much as it is, so 1 within 0.3 to 1.7 over
+    # eight of them. Without the lens in the map's error both are beyond 5.
+    assert 0.3 < of_map < 1.7
+    assert 0.3 < of_poses < 1.7
+
+
+def test_a_corridor_claims_how_much_the_lens_bends_it():
+    check(3, 400)
+
+
+@pytest.mark.nightly
+def test_corridors_claim_how_much_their_lenses_bend_them():
+    check(8, 600)

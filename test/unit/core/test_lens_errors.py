@@ -1,0 +1,39 @@
+"""Errors of the lens as joint draws: their covariance, and that they are the same wherever they are needed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.walls import CAMERA
+
+from thermal_fiducial.core.error_model import corner_correlations, covariance_of, DRAWS, SystematicErrors
+from thermal_fiducial.core.lens_errors import LensErrors
+
+ERRORS = SystematicErrors(corner_px=0.2)
+
+
+@pytest.mark.parametrize(('width', 'height'), [(640, 512), (160, 120), (576, 576)])
+def test_draws_have_the_covariance_of_the_error_model(width, height):
+    camera = replace(CAMERA, width=width, height=height)
+    corners = np.random.default_rng(0).uniform(0.0, [width, height], (40, 2))
+    draws = LensErrors(corners, camera, ERRORS).drawn()
+    expected = ERRORS.corner_px**2 * corner_correlations(corners, width, ERRORS)
+    modes = 2 * 6 * (2 + int(height / (0.25 * width)))
+    # Between nodes one length apart the process is known to 1 to 2 %. Draws for more modes than there are draws are not
+    # quite uncorrelated: four standard deviations, of directions of 64 out of that many dimensions.
+    tolerance = 0.03 + 4.0 * np.sqrt(max(1.0 / DRAWS - 1.0 / modes, 0.0))
+    for axis in (0, 1):
+        assert np.abs(covariance_of(draws[:, axis]) - expected).max() < tolerance * ERRORS.corner_px**2
+
+
+def test_a_camera_has_one_lens():
+    corners = np.random.default_rng(0).uniform(0.0, 500.0, (3, 4, 2))
+    everywhere = LensErrors(corners, CAMERA, ERRORS).drawn()
+    here = LensErrors(corners[1:2], CAMERA, ERRORS)
+    # The same sums of products, in another order.
+    assert np.allclose(here.drawn()[0], everywhere[1], rtol=0.0, atol=1e-12)
+    assert np.allclose(here.drawn(slice(8, 16))[0], everywhere[1, :, :, 8:16], rtol=0.0, atol=1e-12)
+    other = LensErrors(corners, replace(CAMERA, K=CAMERA.K + np.diag([1.0, 1.0, 0.0])), ERRORS).drawn()
+    correlation = np.vdot(other, everywhere) / (np.linalg.norm(other) * np.linalg.norm(everywhere))
+    # Two lenses, 64 draws of at least four independent values each: four standard deviations.
+    assert abs(correlation) < 4.0 / np.sqrt(4 * DRAWS)

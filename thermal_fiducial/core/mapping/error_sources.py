@@ -1,0 +1,95 @@
+"""What the errors of an adjusted map come from, as joint draws: noise, the markers' shapes, and the lens.
+
+Two markers that are seen in the same frames have nearly the same error, which a covariance of each does not say. Draws
+of all markers together do: the error of a pose by several markers is its derivative times theirs, draw by draw.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.core.error_model import DRAWS, shape_of_corners, SystematicErrors
+from thermal_fiducial.core.lens_errors import LensErrors
+from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem
+from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
+from thermal_fiducial.core.types import FloatArray
+
+#: Draws that are propagated at a time, which bounds the memory.
+_AT_ONCE = 32
+
+
+@dataclass(frozen=True)
+class ErrorSources:
+    """Errors of the M markers of an adjustment by those of what it was made from."""
+
+    problem: MapProblem
+    system: ReducedSystem
+    now: Linearised
+    #: (n,) robust weights of the views
+    weights: FloatArray
+    rng: np.random.Generator
+
+    def noise(self, widened: float, of_held: FloatArray) -> FloatArray:
+        """(M, 6, K) by noise of corners and priors, and by the held markers.
+
+        Parameters
+        ----------
+        widened : factor of the variances of corners and priors
+        of_held : (M, 6, 6) covariances of the held markers, others are not used
+        """
+        problem, roots = self.problem, np.sqrt(widened * self.weights)[:, None, None]
+        of_frame, of_marker = (
+            np.sqrt(widened) * _root(priors.information) for priors in (problem.odometry, problem.known)
+        )
+        parts = []
+        for _ in range(0, DRAWS, _AT_ONCE):
+            of_frames, of_markers = self._sides(roots * self._normal(len(roots), 8))
+            of_frames += of_frame @ self._normal(len(of_frame), 6)
+            of_markers += of_marker @ self._normal(len(of_marker), 6)
+            parts.append(self.system.solve(of_frames, of_markers)[1])
+        held = _root(of_held) @ self.rng.standard_normal((len(of_held), 6, DRAWS))
+        return np.concatenate(parts, axis=-1) + self.system.by_held(held)
+
+    def lasting(self, errors: SystematicErrors) -> FloatArray:
+        """(M, 6, K) by corner errors that are the same in all views of a marker, and by those of the lens.
+
+        They do not average out and leave no residuals: the shape of a fixed marker rotates the whole map, and a lens
+        that is wrong bends it.
+        """
+        problem, weights = self.problem, self.weights[:, None, None]
+        shapes, parts = self._shapes(errors)[:, None, None, None], []
+        views = [problem.camera == index for index in range(len(problem.cameras))]
+        lenses = [
+            LensErrors(problem.corners[own], camera, errors) for own, camera in zip(views, problem.cameras, strict=True)
+        ]
+        for first in range(0, DRAWS, _AT_ONCE):
+            off = (shapes * self.rng.standard_normal((len(shapes), 4, 2, _AT_ONCE)))[problem.marker]
+            for own, lens in zip(views, lenses, strict=True):
+                off[own] += lens.drawn(slice(first, first + _AT_ONCE))
+            sides = self._sides(weights * (problem.W @ off).reshape(-1, 8, _AT_ONCE))
+            parts.append(self.system.solve(*sides)[1])
+        return np.concatenate(parts, axis=-1)
+
+    def _normal(self, *shape: int) -> FloatArray:
+        return self.rng.standard_normal((*shape, _AT_ONCE))
+
+    def _sides(self, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Right sides (F, 6, k) and (M, 6, k) of the normal equations for weighted residuals (n, 8, k)."""
+        problem, now = self.problem, self.now
+        of_frames = problem.over_frames(np.swapaxes(now.J_camera, -1, -2) @ residuals)
+        return of_frames, problem.over_markers(np.swapaxes(now.J_marker, -1, -2) @ residuals)
+
+    def _shapes(self, errors: SystematicErrors) -> FloatArray:
+        """Standard deviations (M,) [px] of corner errors that are the same in all views of a marker."""
+        problem = self.problem
+        precision = 0.5 * np.mean(np.sum(problem.W**2, axis=(2, 3)), axis=1)
+        views = np.bincount(problem.marker)
+        middle = np.cumsum(views) - 1 - views // 2
+        typical = 1.0 / precision[np.lexsort((precision, problem.marker))[middle]]
+        return shape_of_corners(views / np.bincount(problem.marker, precision), typical, errors)
+
+
+def _root(matrices: FloatArray) -> FloatArray:
+    """Square roots (n, 6, 6) of positive semidefinite matrices."""
+    values, vectors = np.linalg.eigh(matrices)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
