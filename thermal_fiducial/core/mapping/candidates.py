@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import noise_factor
+from thermal_fiducial.core.error_model import noise_factor, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.keyframes import Displacement
@@ -86,13 +86,13 @@ class Candidate:
         ]
         self._directions = [T[:3, :3] @ direction for direction, T in zip(self._directions, moves, strict=True)]
 
-    def place(self, camera: Camera) -> Placement:
+    def place(self, camera: Camera, errors: SystematicErrors) -> Placement:
         """Pose in the map if the views determine it uniquely."""
         self.untried = 0
         nothing = np.zeros((6, 6))
         if len(self.views) < MIN_VIEWS:
             return Placement(None, nothing, f'marker {self.id} needs views from more directions')
-        fits = self._fits(camera)
+        fits = self._fits(camera, errors)
         if not fits.chi2[0] <= INCONSISTENT * len(self.views):
             return Placement(None, nothing, f'marker {self.id}: its views contradict each other')
         scale = noise_factor(float(fits.chi2[0]), 8 * len(self.views) - 6)
@@ -105,7 +105,7 @@ class Candidate:
 
     def solutions(self, camera: Camera) -> list[FloatArray]:
         """All poses (4, 4) that a fit to the views ends in, the best first."""
-        fits, poses = self._fits(camera), list[FloatArray]()
+        fits, poses = self._fits(camera, SystematicErrors()), list[FloatArray]()
         for T in fits.T[np.isfinite(fits.chi2)]:
             if all(rotation_angle(T[:3, :3].T @ other[:3, :3]) > SAME_POSE for other in poses):
                 poses.append(T)
@@ -118,11 +118,11 @@ class Candidate:
         index = int(np.argmax(np.max(cosines, axis=1)))
         del self.views[index], self._directions[index]
 
-    def _fits(self, camera: Camera) -> FittedPoses:
+    def _fits(self, camera: Camera, errors: SystematicErrors) -> FittedPoses:
         """Fits from every branch of two views far apart."""
         pairs = [view.viewpoint.poses[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
         starts = np.concatenate([pair.reshape(-1, 4, 4) for pair in pairs])
-        return MarkerViews(self.views, self.size, camera).fit(starts[np.all(np.isfinite(starts), axis=(1, 2))])
+        return MarkerViews(self.views, self.size, camera, errors).fit(starts[np.all(np.isfinite(starts), axis=(1, 2))])
 
 
 class NewMarkers:
@@ -138,7 +138,7 @@ class NewMarkers:
         self.candidates: dict[int, Candidate] = {}
 
     def show(
-        self, stamp_ns: int, seen: Observations, camera: Camera, viewpoint: Viewpoint
+        self, stamp_ns: int, seen: Observations, camera: Camera, viewpoint: Viewpoint, errors: SystematicErrors
     ) -> tuple[list[MapMarker], dict[int, str]]:
         """Add a frame's views to the candidates, except markers without a pose.
 
@@ -157,7 +157,7 @@ class NewMarkers:
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
             if not candidate.untried:
                 continue
-            placement = candidate.place(camera)
+            placement = candidate.place(camera, errors)
             candidate.reason = placement.reason
             if placement.T_map_marker is not None:
                 marker = entry(stamp_ns, candidate, placement.T_map_marker, placement.covariance)

@@ -175,7 +175,7 @@ class MarkerMapper:
 
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, Waiting]:
         """Add views to the candidates of new markers; whether any entered the map, and what the others wait for."""
-        placed, waiting = self._new.show(frame.stamp_ns, frame.new, frame.camera, viewpoint)
+        placed, waiting = self._new.show(frame.stamp_ns, frame.new, frame.camera, viewpoint, self._errors)
         self.map.markers |= {marker.id: marker for marker in placed}
         self.map.revision += bool(placed)
         return bool(placed), waiting

@@ -9,6 +9,7 @@ from thermal_fiducial.core.error_model import correlated_sum, covariance_of, DRA
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import linearise
 from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
+from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.types import FloatArray, IntArray
 
 #: Poses nearer to each other than this [rad] are one pose, and not the two of a planar ambiguity.
@@ -86,6 +87,12 @@ class FittedPoses:
     camera_covariances: FloatArray
     common: FloatArray
     draws: FloatArray | None
+    #: (n, 8, 8) by which residuals became white; (n, 8, 8), (n, 6, 6) noise of corners [px^2] and cameras, and
+    #: (n, 8, K) draws of the errors of the lens at the corners [px]
+    W: FloatArray
+    corner_noise: FloatArray
+    camera_noise: FloatArray
+    of_lens: FloatArray
 
     def errors(self, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray | None]:
         """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error where the cameras' errors have some.
@@ -94,12 +101,15 @@ class FittedPoses:
         """
         white = np.linalg.inv(np.einsum('vri,vrj->ij', self.J_marker, self.J_marker))
         gains = -white @ np.einsum('vri,vrj->vij', self.J_marker, self.J_camera)
-        own = noise * white + correlated_sum(gains, self.common)
+        of_common = correlated_sum(gains, self.common)
         if self.draws is None:
-            return own + correlated_sum(gains, self.camera_covariances), None
+            return noise * white + of_common + correlated_sum(gains, self.camera_covariances), None
+        by_corner = white @ np.swapaxes(self.J_marker, -1, -2) @ self.W
         shared = np.tensordot(gains, self.draws, axes=([0, 2], [0, 1]))
-        of_noise = np.linalg.cholesky(noise * white) @ rng.standard_normal((6, DRAWS))
-        return own + covariance_of(shared), shared + of_noise
+        shared += np.tensordot(by_corner, self.of_lens, axes=([0, 2], [0, 1]))
+        own = noise * (_summed(by_corner, self.corner_noise) + _summed(gains, self.camera_noise))
+        of_noise = np.linalg.cholesky(own) @ rng.standard_normal((6, DRAWS))
+        return own + of_common + covariance_of(shared), shared + of_noise
 
 
 @dataclass(frozen=True)
@@ -116,13 +126,15 @@ class _Weights:
 class MarkerViews:
     """n views of one marker as arrays."""
 
-    def __init__(self, views: Sequence[MarkerView], size: float, camera: Camera) -> None:
+    def __init__(self, views: Sequence[MarkerView], size: float, camera: Camera, errors: SystematicErrors) -> None:
         self._camera, self._size = camera, size
         self._corners = np.stack([view.corners for view in views]).reshape(-1, 8)
-        covariances = np.stack([view.corner_covariances for view in views])
+        self._errors = errors
+        covariances = self._corner_covariances = np.stack([view.corner_covariances for view in views])
         self._noise = with_corner_errors(covariances, SystematicErrors())
         self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
         self._covariances = np.stack([view.viewpoint.covariances for view in views])
+        self._camera_noise = self._covariances
         self._common = np.stack([view.viewpoint.common for view in views])
         draws = [view.viewpoint.draws for view in views if view.viewpoint.draws is not None]
         self._draws = np.stack(draws) if len(draws) == len(views) else None
@@ -153,7 +165,17 @@ class MarkerViews:
             T[order], chi2[order], cost[order],
             W @ J_camera[best], W @ J_marker[best], covariances[best], self._common,
             None if self._draws is None else self._draws[np.arange(len(used[best])), used[best]],
+            W, self._corner_noise(), self._camera_noise[np.arange(len(used[best])), used[best]],
+            LensErrors(self._corners.reshape(-1, 4, 2), self._camera, self._errors).drawn().reshape(-1, 8, DRAWS),
         )  # fmt: skip
+
+    def _corner_noise(self) -> FloatArray:
+        """Covariances (n, 8, 8) of the corners' noise [px^2]."""
+        noise = np.zeros((len(self._corners), 8, 8))
+        for corner in range(4):
+            both = slice(2 * corner, 2 * corner + 2)
+            noise[:, both, both] = self._corner_covariances[:, corner]
+        return noise
 
     def _choose(self, T: FloatArray) -> IntArray:
         """The likelier of the two camera poses of each view, (S, n), for a marker at T."""
@@ -211,3 +233,8 @@ class MarkerViews:
         possible = np.all(np.isfinite(begun.log_determinants), axis=-1)
         T, chi2, _ = minimise(T, evaluated, alternatives=len(T))
         return T, np.where(possible, chi2, np.inf)
+
+
+def _summed(gains: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a sum of independent errors: gains (n, 6, m), covariances (n, m, m)."""
+    return np.asarray(np.sum(gains @ covariances @ np.swapaxes(gains, -1, -2), axis=0))

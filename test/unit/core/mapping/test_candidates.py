@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.small_bag import CAMERA as STRAIGHT
 
-from thermal_fiducial.core.error_model import covariance_of, DRAWS
+from thermal_fiducial.core.error_model import covariance_of, DRAWS, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.candidates import Candidate
@@ -35,7 +35,7 @@ def test_a_start_through_a_camera_is_no_marker(gap):
     candidate.add(view(0, transform(np.eye(3), [0.1, 0.2, 0.0])))
     candidate.add(view(1, transform(turned, corner - turned @ [1e-3, 2e-3, gap])))
     candidate.add(view(2, transform(so3_exp([-0.1, 0.0, 0.0]), [2.0, 2.0, 0.0])))
-    placement = candidate.place(CAMERA)
+    placement = candidate.place(CAMERA, SystematicErrors())
     assert placement.T_map_marker is None
     assert 'marker 7' in placement.reason
 
@@ -51,11 +51,11 @@ def seen_from(x, draws):
     )
 
 
-def placed(*draws):
+def placed(*draws, lens_px=0.0):
     candidate = Candidate(7, SIZE)
     for x, own in zip((-0.3, 0.0, 0.3), draws, strict=True):
         candidate.add(seen_from(x, own))
-    return candidate.place(CAMERA)
+    return candidate.place(CAMERA, SystematicErrors(corner_px=lens_px))
 
 
 def test_a_new_marker_has_the_errors_of_the_cameras_draw_by_draw():
@@ -65,6 +65,15 @@ def test_a_new_marker_has_the_errors_of_the_cameras_draw_by_draw():
     # Cameras that are shifted alike shift the marker by as much.
     assert np.allclose(shared.draws - known.draws, shift, rtol=0.0, atol=1e-9)
     assert np.allclose(shared.covariance - known.covariance, covariance_of(shift), rtol=0.0, atol=1e-9)
+
+
+def test_a_new_marker_has_the_errors_of_the_lens_at_its_own_corners():
+    exact = [np.zeros((6, DRAWS))] * 3
+    alone, behind_lens, behind_worse = (placed(*exact, lens_px=px) for px in (0.0, 0.1, 0.2))
+    variances = [(p.covariance - alone.covariance).diagonal() for p in (behind_lens, behind_worse)]
+    assert np.all(variances[0] > 0.0)
+    # Errors twice as large in the same draws: four times the variance, to rounding.
+    assert np.allclose(variances[1], 4.0 * variances[0], rtol=1e-6)
 
 
 def test_where_one_view_has_no_draws_the_errors_count_as_correlated_anyhow():
