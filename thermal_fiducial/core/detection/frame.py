@@ -180,12 +180,19 @@ def counts_of(pixel: IntArray, image: Float32Array, to_tails: FloatArray | None 
     width = np.float32(image.shape[1])
     by_marker = pixel.reshape(pixel.shape[0] * pixel.shape[1], len(to_tails), -1).astype(np.float32)
     # In the middle of a pixel, so that rounding does not change the row: integers take four times as long to divide.
-    v = np.floor((by_marker + np.float32(0.5)) / width)
-    u = by_marker - width * v
-    maps = to_tails.astype(np.float32)[..., None]
-    to_u, to_v = (
-        (maps[:, row, 0] * u + maps[:, row, 1] * v + maps[:, row, 2]).reshape(len(by_marker), -1) for row in (0, 1)
-    )
+    # In place: fresh memory takes as long as what is computed in it.
+    v = by_marker + np.float32(0.5)
+    v /= width
+    np.floor(v, out=v)
+    u = by_marker
+    u -= width * v
+    maps, tails = to_tails.astype(np.float32)[..., None], []
+    for row in (0, 1):
+        place = maps[:, row, 0] * u
+        place += maps[:, row, 1] * v
+        place += maps[:, row, 2]
+        tails.append(place.reshape(len(by_marker), -1))
+    to_u, to_v = tails
     lag_tails = np.asarray(cv2.remap(image, to_u, to_v, _EXACT, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32)
     return without_tails(counts, lag_tails.reshape(counts.shape))
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corners.segments import median_of, Segments, UNMEASURED
-from thermal_fiducial.core.detection.corners.sides import Blur, reaches, Sides
+from thermal_fiducial.core.detection.corners.segments import Segments
+from thermal_fiducial.core.detection.corners.sides import reaches, Sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Stacked
 
 # Distance from the sides [blurs] beyond which pixels do not count where a gradient of temperature displaces a side: it
@@ -49,21 +49,19 @@ class Reach(Stacked):
         """Which markers (N,) have near pixels only."""
         return np.asarray(np.isfinite(self.inside).any(axis=1))
 
-    def bound(self, counting: BoolArray, sides: Sides) -> None:
-        """Of the pixels that count (M, C, E, m) leave those within reach."""
-        if np.isfinite(self.outside).any():
-            inside, outside = (part.reshape(-1, 1).astype(np.float32) for part in (self.inside, self.outside))
-            counting &= (sides.distance <= inside) & (sides.distance >= -outside)
+    def limits(self, sides: Sides, width: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distances (E, m) inside and outside the sides up to which pixels count, for blur of ``width`` (E, m) [px]."""
+        inward, outward = reaches(sides, width)
+        return np.minimum(inward, self.inside.reshape(-1, 1)), np.minimum(outward, self.outside.reshape(-1, 1))
 
-    def outward(self, sides: Sides, width: FloatArray) -> FloatArray:
-        """Distance (E, m) outside the sides up to which pixels count, for blur of ``width`` (E, m) [px]."""
-        _, most = reaches(sides, width)
-        most = np.minimum(most, np.abs(sides.distance[0]).mean(axis=0))
-        return np.asarray(np.minimum(most, self.outside.reshape(-1, 1)))
+    def nearer(self, uneven: BoolArray, ending: BoolArray, outward: FloatArray, width: FloatArray) -> 'Reach':
+        """The same with near pixels alone for ``uneven`` markers (N,), and less at ``ending`` sides (N, 4).
 
-    def nearer(self, uneven: BoolArray, ending: BoolArray, sides: Sides, blur: Blur) -> 'Reach':
-        """The same with near pixels alone for ``uneven`` markers (N,), and less at ``ending`` sides (N, 4)."""
-        outward, width = (part.mean(axis=1).reshape(-1, 4) for part in (self.outward(sides, blur.width), blur.width))
+        Parameters
+        ----------
+        outward, width : (E, m) distance outside the sides up to which pixels count, and the blur [px]
+        """
+        outward, width = (part.mean(axis=1).reshape(-1, 4) for part in (outward, width))
         near = np.where(uneven[:, None], _WITH_GRADIENT * width, np.inf)
         before = np.where(ending, np.maximum(outward - _END_REACHES * width, _LEAST_WHITE * width), np.inf)
         return replace(
@@ -91,32 +89,32 @@ def ending_sides(
     outward, width : (E, m) distance outside the sides up to which pixels count, and the blur [px]
     motion_px : (N,) blur by motion
     """
-    contrast, noise = _typical(segments, segments.contrast), _typical(segments, segments.noise)
+    contrast, noise = segments.typical[:, 0], segments.noise.min(axis=1)
     looked_at = (noise > (_MISFIT * contrast) ** 2) & (motion_px < _STILL_PX)
     if not looked_at.any():
         return np.zeros((len(contrast), 4), dtype=bool)
     value, _, counting = modelled
-    contrast, noise = np.repeat(contrast, 4), np.repeat(noise, 4)
-    most, width = outward.mean(axis=1), width.mean(axis=1)
-    begins, halfway = _WHITE_BEGINS * width, 0.5 * (_WHITE_BEGINS * width + most)
+    # For each part, not for each side: numpy is slow where it repeats the few numbers of a row.
+    begins = _WHITE_BEGINS * width
+    limits = np.array(
+        [begins, 0.5 * (begins + outward), np.repeat(contrast, width.size // len(contrast)).reshape(width.shape)],
+        dtype=np.float32,
+    )
     step = 2 if counts.shape[1] >= _MANY else 1
-    distance = sides.distance[:, ::step]
-    planes = np.empty((4, *distance.shape), dtype=np.float32)
-    planes[0] = counting[:, ::step] & (distance < -begins.astype(np.float32)[:, None])
-    np.multiply(planes[0], distance < -halfway.astype(np.float32)[:, None], out=planes[1])
-    rest = counts[:, ::step] - counts[0, 0, 0, 0] - value[:, ::step] * contrast.astype(np.float32)[:, None]
+    outside = -sides.distance[:, ::step]
+    planes = np.empty((4, *outside.shape), dtype=np.float32)
+    np.multiply(counting[:, ::step], outside > limits[0], out=planes[0])
+    np.multiply(planes[0], outside > limits[1], out=planes[1])
+    rest = counts[:, ::step] - counts[0, 0, 0, 0]
+    rest -= value[:, ::step] * limits[2]
     np.multiply(planes[:2], rest, out=planes[2:])
     # Of all the white, and of its outer half. A product of matrices adds up three times as fast as a sum.
-    moments = np.ones(distance[:, :, 0, 0].size, dtype=np.float32) @ planes.reshape(4, -1, value[0, 0].size)
+    moments = np.ones(outside[:, :, 0, 0].size, dtype=np.float32) @ planes.reshape(4, -1, value[0, 0].size)
     white, outer, white_sum, outer_sum = moments.reshape(4, *value.shape[2:]).sum(axis=2)
+    contrast, noise = np.repeat(contrast, 4), np.repeat(noise, 4)
     number = np.array([outer, white - outer])
     level = np.array([outer_sum, white_sum - outer_sum]) / np.maximum(number, 1)
     variance = noise * (1.0 / np.maximum(number, 1)).sum(axis=0)
     darker = (level[1] - level[0]) * np.sign(contrast) > _FADES * np.abs(contrast) + _SURE * np.sqrt(variance)
-    judged = (number >= _FEWEST).all(axis=0) & (most > _LEAST_WHITE * width)
-    return np.asarray(darker & judged).reshape(-1, 4) & looked_at[:, None]
-
-
-def _typical(segments: Segments, values: FloatArray) -> FloatArray:
-    """Median (N,) of the values (N, S) of segments that are measured."""
-    return median_of(values, segments.variance < UNMEASURED)[:, 0]
+    judged = (number >= _FEWEST).all(axis=0) & (outward > _LEAST_WHITE * width).all(axis=1)
+    return np.asarray((darker & judged).reshape(-1, 4) & looked_at[:, None])

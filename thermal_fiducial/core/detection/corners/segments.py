@@ -4,6 +4,7 @@ A segment is as long as a cell. It measures the displacement of its side, with a
 variance from its own residuals. Clutter, dead pixels and covered parts make outliers of the segments that they affect.
 """
 
+from functools import cache
 import math
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from thermal_fiducial.core.detection.corner_errors import (
     OF_SIDES_PX,
     OF_UNEVEN_CONTRAST_PX,
 )
-from thermal_fiducial.core.detection.corners.sides import ENDS, OPPOSITE, Sides, STARTS
+from thermal_fiducial.core.detection.corners.sides import ENDS, Sides, STARTS
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, SIGMA_OF_MEDIAN, TINY
 
 #: Largest displacement for which the linearisation holds, in standard deviations of the blur.
@@ -64,13 +65,14 @@ class Segments(NamedTuple):
     #: variance of the displacement [px^2]
     variance: FloatArray
     contrast: FloatArray
-    #: variance of a pixel about the model
+    #: variance of a pixel about the model; the least one is that of the typical segment
     noise: FloatArray
+    #: (N, 1) contrast of the typical segment, 0 where there is none
+    typical: FloatArray
 
     def displaced_by_slopes(self) -> FloatArray:
         """Displacement (N,) of a side by a slope of its contrast across it as large as that along it, rms [px]."""
-        contrast = np.abs(median_of(self.contrast, self.variance < UNMEASURED)[:, 0])
-        return OF_UNEVEN_CONTRAST_PX * self._slope_of_contrast() / np.maximum(contrast, TINY)
+        return OF_UNEVEN_CONTRAST_PX * self._slope_of_contrast() / np.maximum(np.abs(self.typical[:, 0]), TINY)
 
     def _slope_of_contrast(self) -> FloatArray:
         """Slope (N,) of the contrast along the sides, rms, as a change from segment to segment.
@@ -141,10 +143,16 @@ def measure(
     X = X.reshape(_PLANES, counts.shape[0] * counts.shape[1], -1)
     fit = _fit(X, segments)
     lines = np.array([fit.level, fit.contrast, fit.product, _PIXEL_OUTLIER * np.sqrt(fit.noise)], dtype=np.float32)
-    level, contrast, product, limit = lines.reshape(4, -1)
-    inliers = np.abs(X[3] - level * X[0] - contrast * X[1] - product * X[2]) <= limit
+    lines = lines.reshape(4, 1, -1)
+    # In the room for products: fresh memory takes as long as what is computed in it.
+    np.multiply(X[:3], lines[:3], out=X[4:7])
+    left = np.subtract(X[3], X[4], out=X[4])
+    left -= X[5]
+    left -= X[6]
+    inliers = np.abs(left, out=left) <= lines[3]
     if not inliers.all():
-        X[:4] *= inliers
+        left[:] = inliers
+        X[:4] *= left
         fit = _fit(X, segments)
     return _judged(fit, reach.reshape(fit.noise.shape))
 
@@ -189,7 +197,8 @@ def _judged(fit: _SegmentFit, reach: FloatArray) -> Segments:
     others = (_CONTRAST_VARIES * typical) ** 2 + TINY
     safe = np.where(usable, (contrast * others + typical * own) / (others + own), 1.0)
     shift = np.where(usable, np.minimum(np.maximum(-product / safe, -reach), reach), 0.0)
-    return Segments(shift, np.where(usable, noise * fit.product_variance / (safe * safe), UNMEASURED), contrast, noise)
+    variance = np.where(usable, noise * fit.product_variance / (safe * safe), UNMEASURED)
+    return Segments(shift, variance, contrast, noise, typical)
 
 
 def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> tuple[Segments, BoolArray]:
@@ -207,29 +216,34 @@ def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> tuple[Se
     -------
     the segments, and whether (N,) a gradient displaces a side of a marker by more than its other errors do
     """
-    count, cells = len(segments.shift), sides.across.shape[1]
-    good = (segments.variance < UNMEASURED).reshape(count, 4, cells)
-    used = good.sum(axis=2)
+    # Opposite sides follow each other: (N, 2, 2) are pairs of them.
+    opposite, shape = (..., slice(None, None, -1)), (len(segments.shift), 2, 2, sides.across.shape[1])
+    good = (segments.variance < UNMEASURED).reshape(shape)
+    used = good.sum(axis=3)
     number, seen = np.maximum(used, 1), used > 0
-    contrast = (segments.contrast.reshape(good.shape) * good).sum(axis=2) / number
-    relative = (segments.variance.reshape(good.shape) * good).sum(axis=2) / (number * blur_px) ** 2
-    noise = contrast**2 * relative
-    both = seen & seen[:, OPPOSITE]
-    change = np.where(both, (contrast - contrast[:, OPPOSITE]) ** 2 - noise - noise[:, OPPOSITE], 0.0)
-    gradient = np.sqrt(np.maximum(change, 0.0)) / sides.across.reshape(good.shape).mean(axis=2)
+    contrast = (segments.contrast.reshape(shape) * good).sum(axis=3) / number
+    relative = (segments.variance.reshape(shape) * good).sum(axis=3) / (number * blur_px) ** 2
+    noise = contrast * contrast * relative
+    both, difference = seen & seen[opposite], contrast - contrast[opposite]
+    change = np.where(both, difference * difference - noise - noise[opposite], 0.0)
+    gradient = np.sqrt(np.maximum(change, 0.0)) * (shape[3] / sides.across.reshape(shape).sum(axis=3))
     left = np.abs(contrast) - GRADIENT_AS_CONTRAST_PX * gradient
     std = np.where(left > 0.0, OF_GRADIENT_PX2 * gradient / np.maximum(left, TINY), np.inf)
     error = np.sqrt(blur_px**2 * relative / number + OF_SIDES_PX**2)
     beyond_error = (std > _GRADIENT_SHOWS * error) & both
-    variance = np.minimum(segments.variance + np.repeat(number * std**2, cells, axis=1), UNMEASURED)
-    return segments._replace(variance=variance), np.asarray(beyond_error.any(axis=1))
+    variance = np.minimum(segments.variance.reshape(shape) + (number * std * std)[..., None], UNMEASURED)
+    return (
+        segments._replace(variance=variance.reshape(segments.variance.shape)),
+        np.asarray(beyond_error.any(axis=(1, 2))),
+    )
 
 
 def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
     """Medians (N, 1) of the good ones of values (N, S), 0 where there is none."""
     if good.all():
-        middle = (values.shape[1] - 1) // 2
-        return np.partition(values, middle, axis=1)[:, middle, None]
+        middle, order = (values.shape[1] - 1) // 2, values.copy()
+        order.partition(middle, axis=1)
+        return order[:, middle, None]
     number = good.sum(axis=1)
     order = np.where(good, values, np.inf)
     order.sort(axis=1)
@@ -241,12 +255,16 @@ def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
 def adjust(sides: Sides, segments: Segments) -> tuple[FloatArray, FloatArray]:
     """Displacements (N, 8, 1) of the corners that fit all segments, and their covariances (N, 8, 8)."""
     used, cells = segments.variance < UNMEASURED, sides.normal.shape[1]
-    # A segment is a part of its side, between the corners that the side begins and ends at.
-    share = _AT_START + ((np.arange(cells) + 0.5) / cells)[:, None] * _ONWARD
-    A = (share[..., None] * sides.normal.reshape(-1, 4, cells, 1, 2)).reshape(-1, 4 * cells, 8)
+    A = (_shares(cells)[..., None] * sides.normal.reshape(-1, 4, cells, 1, 2)).reshape(-1, 4 * cells, 8)
     sharpness = 1.0 / np.sqrt(segments.variance)
     fit = robust_fit(A * sharpness[..., None], segments.shift * sharpness, used, _PRIOR)
     return fit.moved, fit.covariance + OF_SIDES_PX**2 * _EYE
+
+
+@cache
+def _shares(cells: int) -> FloatArray:
+    """Shares (4, m, 4) of the corners in segments: parts of a side, between the corners that it begins and ends at."""
+    return np.asarray(_AT_START + ((np.arange(cells) + 0.5) / cells)[:, None] * _ONWARD)
 
 
 def robust_fit(A: FloatArray, shift: FloatArray, used: BoolArray, prior: FloatArray) -> RobustFit:

@@ -13,12 +13,13 @@ from thermal_fiducial.core.detection.corners.reach import ending_sides, Reach
 from thermal_fiducial.core.detection.corners.segments import (
     adjust,
     measure,
+    median_of,
     REACHED,
     Segments,
     UNMEASURED,
     with_gradients,
 )
-from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, ONE_GAUSSIAN, Sides, sides_of
+from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, ONE_GAUSSIAN, reaches, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.corners.uneven_contrast import freed_of_unevenness
 from thermal_fiducial.core.detection.frame import counts_of, MotionBlur, WITHOUT_TAIL
@@ -60,33 +61,59 @@ def refine_corners(
     motion : blur by motion; none when left out
     reach : which pixels count; all that the cells allow when left out
     """
-    motion, reach = motion or MotionBlur.none(len(corners.px)), reach or Reach.everywhere(len(corners.px))
+    motion = motion or MotionBlur.none(len(corners.px))
     # Where lag tails stay, the blur is so small that it hardly differs from one Gaussian.
     parts = ONE_GAUSSIAN if motion.to_tails is None else WITHOUT_TAIL
-    widest = math.hypot(blur_px, float(np.hypot(*motion.spread.T).max()))
+    motion_px = np.hypot(motion.spread[:, 0], motion.spread[:, 1])
+    widest = math.hypot(blur_px, motion_px.max())
     sides = sides_of(corners.x, camera, image.shape, behind.shape[2], columns, widest)
     blur = blur_of(sides, blur_px, motion.spread, parts)
     counts = counts_of(sides.pixel, image, motion.to_tails)
-    modelled = model(sides, behind, blur)
-    reach.bound(modelled[2], sides)
-    outward = reach.outward(sides, blur.width)
-    measured, displaced_px = _measured(counts, modelled, sides, blur, outward, motion)
+    limits = reach.limits(sides, blur.width) if reach else reaches(sides, blur.width)
+    modelled, outward = model(sides, behind, blur, limits), sides.within_columns(limits[1])
+    measured, displaced_px = _measured(counts, modelled, sides, blur, outward, motion_px)
     segments, shows = with_gradients(measured, sides, widest)
     refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)), displaced_px)
-    ending = ending_sides(counts, modelled, sides, measured, outward, blur.width, np.hypot(*motion.spread.T))
-    # From farther off near pixels pull towards another edge, and another edge ends the surface.
-    shows[moving] = False
-    ending &= (np.abs(refined.corners_px - corners.px).max(axis=(1, 2)) < _SETTLED_PX[1])[:, None]
-    fewer = np.flatnonzero((shows & ~reach.near) | ending.any(axis=1))
-    if len(fewer):
-        moving, reach = np.union1d(moving, fewer), reach.nearer(shows, ending, sides, blur)
-    if passes == 1 or len(moving) == 0:
+    if passes == 1:
         return refined
-    start = corners.only(moving).at_pixels(refined.corners_px[moving])
+    ending = ending_sides(counts, modelled, sides, measured, outward, blur.width, motion_px)
+    shifts = refined.corners_px - corners.px
+    which, reach = _again(moving, shows, ending, shifts, reach or Reach.everywhere(len(moving)), outward, blur.width)
+    if len(which) == 0:
+        return refined
+    start = corners.only(which).at_pixels(refined.corners_px[which])
     again = refine_corners(
-        image, start, camera, behind[moving], blur_px, columns, motion.only(moving), passes - 1, reach.only(moving)
+        image, start, camera, behind[which], blur_px, columns, motion.only(which), passes - 1, reach.only(which)
     )
-    return refined.with_others(moving, again)
+    return refined.with_others(which, again)
+
+
+def _again(
+    moving: BoolArray,
+    shows: BoolArray,
+    ending: BoolArray,
+    shifts: FloatArray,
+    reach: Reach,
+    outward: FloatArray,
+    width: FloatArray,
+) -> tuple[IntArray, Reach]:
+    """Places (M,) of those of N markers that are to be refined again, and the reach of all.
+
+    From farther off near pixels pull towards another edge, and another edge ends the surface.
+
+    Parameters
+    ----------
+    moving, shows, ending : of :func:`_moved`, :func:`with_gradients` and :func:`ending_sides`
+    shifts : (N, 4, 2) displacement of the corners [px]
+    outward, width : of :func:`ending_sides`
+    """
+    shows = shows & ~moving
+    if ending.any():
+        ending = ending & (np.abs(shifts).max(axis=(1, 2)) < _SETTLED_PX[1])[:, None]
+    if shows.any() or ending.any():
+        moving = moving | (shows & ~reach.near) | ending.any(axis=1)
+        reach = reach.nearer(shows, ending, outward, width)
+    return moving.nonzero()[0], reach
 
 
 def _measured(
@@ -95,24 +122,24 @@ def _measured(
     sides: Sides,
     blur: Blur,
     outward: FloatArray,
-    motion: MotionBlur,
+    motion_px: FloatArray,
 ) -> tuple[Segments, FloatArray]:
     """Segments of N markers as if their contrast were even, and what its slope may displace sides by (N,) [px]."""
     segments = measure(counts, modelled, REACHED * blur.width)
     displaced_px = segments.displaced_by_slopes()
     # Where sides have larger errors anyway, the correction is not worth its own.
-    noise = np.median(segments.variance, axis=1) / sides.across.shape[1]
-    form = OF_LAG_FORM**2 * (motion.spread * motion.spread).sum(axis=1)
-    which = np.flatnonzero(displaced_px > np.sqrt(OF_ALL_SIDES_PX**2 + form + noise))
-    if len(which):
-        segments = freed_of_unevenness(segments, which, sides, outward, blur.width)
+    used = segments.variance < UNMEASURED
+    noise = median_of(segments.variance, used)[:, 0] / sides.across.shape[1]
+    which = displaced_px**2 > OF_ALL_SIDES_PX**2 + (OF_LAG_FORM * motion_px) ** 2 + noise
+    if which.any():
+        segments = freed_of_unevenness(segments, used & which[:, None], sides, outward, blur.width)
     return segments, displaced_px
 
 
 def _moved(
     sides: Sides, segments: Segments, known: Squared, displaced_px: FloatArray
-) -> tuple[RefinedCorners, IntArray]:
-    """Corners after one linearised adjustment, and places (M,) of the markers that have not converged."""
+) -> tuple[RefinedCorners, BoolArray]:
+    """Corners after one linearised adjustment, and which of the markers (N,) have not converged."""
     covariances = known.corner_covariances + OF_ALL_SIDES_PX**2 * _EYE
     # In an outline that is inconsistent with a square, some side belongs to another object.
     doubt = known.doubt * (sides.along.reshape(-1, 4).sum(axis=1) / 4) ** 2
@@ -129,4 +156,4 @@ def _moved(
     # More passes would not make corners better that are displaced by their own contrast.
     covariances = covariances + (displaced_px * displaced_px)[:, None, None, None] * _EYE
     no = np.zeros(len(doubt), dtype=bool)
-    return RefinedCorners(corners, covariances, contrast, noise, doubt, no, no, no), np.flatnonzero(moving)
+    return RefinedCorners(corners, covariances, contrast, noise, doubt, no, no, no), moving

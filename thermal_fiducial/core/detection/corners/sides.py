@@ -78,6 +78,10 @@ class Sides:
     #: (E, 2, 2) where they begin and end [px]
     ends: FloatArray
 
+    def within_columns(self, distance: FloatArray) -> FloatArray:
+        """The distances from the sides (E, m), no longer than columns reach [px]."""
+        return np.asarray(np.minimum(distance, (len(self.distance) // 2) * np.abs(self.normal).max(axis=2)))
+
 
 def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, columns: int, blur_px: float) -> Sides:
     """Sides of quadrilaterals (N, 4, 2) in normalised coordinates.
@@ -229,13 +233,16 @@ def blur_of(sides: Sides, optics: float, motion: FloatArray, parts: FloatArray =
     )
 
 
-def model(sides: Sides, behind: Float32Array, blur: Blur) -> tuple[Float32Array, Float32Array, BoolArray]:
+def model(
+    sides: Sides, behind: Float32Array, blur: Blur, limits: tuple[FloatArray, FloatArray] | None = None
+) -> tuple[Float32Array, Float32Array, BoolArray]:
     """Share of white in every pixel, up to a constant, its derivative by distance, and whether the pixel counts.
 
     Parameters
     ----------
     behind : (N, 4, m, 2) of :func:`edges_behind`
     blur : of the sides
+    limits : (E, m) each, inside and outside; those of :func:`reaches` when left out
 
     Returns
     -------
@@ -246,7 +253,7 @@ def model(sides: Sides, behind: Float32Array, blur: Blur) -> tuple[Float32Array,
     edges, which = behind.reshape(-1, cells, len(NEIGHBOURS)), np.flatnonzero(overlapping.any(axis=1))
     modelled = _blurred_sides(sides, edges, which, blur)
     value, slope, own = (each[0] if len(each) == 1 else each.mean(axis=0) for each in modelled)
-    inward, outward = reaches(sides, blur.width)
+    inward, outward = limits or reaches(sides, blur.width)
     counting: BoolArray = np.asarray(sides.distance >= -outward.astype(np.float32))
     counting &= sides.distance <= inward.astype(np.float32)
     counting &= sides.fresh & (own > _MOSTLY)
@@ -302,10 +309,19 @@ def blurred_step(
 ) -> tuple[Float32Array, Float32Array]:
     """A step from 0 to ``height`` at zero, and its derivative, blurred by a Gaussian of inverse width ``sharpness``."""
     half = np.float32(0.5) * height
+    # In place: fresh memory takes as long as what is computed in it.
     z = distance * sharpness
     square = z * z
-    step = np.tanh(z * (square * _CUBIC + _LINEAR))
-    slope = (1.0 - step * step) * (square * (3.0 * _CUBIC) + _LINEAR) * (half * sharpness)
+    step = np.asarray(square * _CUBIC, dtype=np.float32)
+    step += _LINEAR
+    step *= z
+    np.tanh(step, out=step)
+    slope = np.multiply(step, step, out=z)
+    np.subtract(1.0, slope, out=slope)
+    square *= 3.0 * _CUBIC
+    square += _LINEAR
+    slope *= square
+    slope *= half * sharpness
     step += 1.0
     step *= half
     return step, slope

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.core.detection.corner_errors import SURFACE_FALLS
-from thermal_fiducial.core.detection.corners.segments import median_of, Segments, UNMEASURED
+from thermal_fiducial.core.detection.corners.segments import Segments
 from thermal_fiducial.core.detection.corners.sides import Sides
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray
 
 # Displacement of a blurred step with a slope on one side of it, fitted as a step, over the product of its blur, the
 # distance up to which pixels count, and the slope over the contrast: 0.80 to 0.87 for a blur of 0.5 to 0.9 px and
@@ -26,6 +26,7 @@ _SHOWN_AT, _SHOWN_AT_BLUR = 0.5, 0.6
 # slopes, curvatures, and a change along the sides that is the same going around the marker: columns of pixels that
 # cross sides obliquely show places displaced along them. At the corners both curvatures together are half of one.
 _BEFORE = np.array([1.0, 1.0, 1.0, 2.0 * SURFACE_FALLS, 2.0 * SURFACE_FALLS, 2.0 * SURFACE_FALLS])
+_PRIOR = np.diag(_BEFORE**-2.0).ravel()
 # Least number of segments that show it, and range of their contrasts over that of the typical one: others are not of
 # the marker alone. Least contrast by which a displacement is divided.
 _FEWEST, _ODD, _LEAST = 8, 0.7, 0.3
@@ -38,9 +39,10 @@ class _Perimeter(NamedTuple):
 
     #: (S, 6) its terms: level, slopes, curvatures, change around the marker
     terms: FloatArray
-    #: (2, S), (2, S) slopes inward of the linear terms and of the quadratic ones
-    of_linear: FloatArray
-    of_quadratic: FloatArray
+    #: (S, 36) products of each of them with each
+    products: FloatArray
+    #: (3, 6, S) of each: its value, its slope inward if it is linear, and that if it is quadratic
+    drawn: FloatArray
     #: (S,) whether segments are not at the ends of their sides, and (S, S) what a fit to these leaves of values there
     inner: BoolArray
     left: FloatArray
@@ -57,47 +59,50 @@ def _perimeter(cells: int) -> _Perimeter:
     inner = np.tile(np.abs(along) < 0.5 - 1.0 / cells, 4)
     left = np.zeros((len(x), len(x)))
     left[np.ix_(inner, inner)] = np.eye(inner.sum()) - terms[inner] @ np.linalg.pinv(terms[inner])
-    return _Perimeter(terms, -outward, -2.0 * outward * np.stack([x, y]), inner, left)
+    products = (terms[:, :, None] * terms[:, None]).reshape(len(x), -1)
+    drawn = np.zeros((3, *terms.T.shape))
+    drawn[0], drawn[1, 1:3], drawn[2, 3:5] = terms.T, -outward, -2.0 * outward * np.stack([x, y])
+    return _Perimeter(terms, products, drawn, inner, left)
 
 
 def freed_of_unevenness(
-    segments: Segments, which: IntArray, sides: Sides, outward: FloatArray, blur: FloatArray
+    segments: Segments, used: BoolArray, sides: Sides, outward: FloatArray, blur: FloatArray
 ) -> Segments:
-    """The segments of N markers, at ``which`` without what slopes of the contrast across the sides displace them by.
+    """The segments of N markers, without what slopes of the contrast across the sides displace those ``used`` by.
 
     Parameters
     ----------
+    used : (N, S) the measured ones of uneven markers
     outward : (E, m) distance up to which pixels outside the sides count [px]
     blur : (E, m) standard deviation of the blur across the sides [px]
     """
-    used = segments.variance < UNMEASURED
-    typical = median_of(segments.contrast, used)
-    across, outward, blur = (part.reshape(used.shape)[which] for part in (sides.across, outward, blur))
-    relative = segments.contrast[which] / typical[which]
-    away = (_SHOWN_AT * outward + _SHOWN_AT_BLUR * blur) / across
-    contrast, slope = _quadratic(relative, used[which], away, sides.across.shape[1])
-    displaced = _DISPLACES * blur * outward * slope / (across * np.maximum(contrast, _LEAST))
-    shift = segments.shift.copy()
-    shift[which] -= np.where(used[which], displaced, 0.0)
-    return segments._replace(shift=shift)
+    relative = segments.contrast / np.where(segments.typical == 0.0, 1.0, segments.typical)
+    reached, blurred = ((part / sides.across).reshape(used.shape) for part in (outward, blur))
+    # Farther out are steeper slopes of a curvature, and larger differences by a slope.
+    farther = 1.0 + 2.0 * (_SHOWN_AT * reached + _SHOWN_AT_BLUR * blurred)
+    contrast, linear, quadratic = _quadratic(relative, used, sides.across.shape[1])
+    slope = linear / farther + quadratic * farther
+    displaced = _DISPLACES * blur.reshape(used.shape) * reached * slope / np.maximum(contrast, _LEAST)
+    return segments._replace(shift=segments.shift - displaced * used)
 
 
-def _quadratic(contrast: FloatArray, used: BoolArray, away: FloatArray, cells: int) -> tuple[FloatArray, FloatArray]:
-    """The contrast (N, S) as a quadratic function, and its slope inward across the sides, over sides.
+def _quadratic(contrast: FloatArray, used: BoolArray, cells: int) -> FloatArray:
+    """The contrast (N, S) as a quadratic function, and its slopes inward by linear and by quadratic terms, over sides.
 
-    ``away`` (N, S): distance of the places from the sides, outward [sides].
+    Returns
+    -------
+    (3, N, S)
     """
     around = _perimeter(cells)
-    good = used & around.inner & (np.abs(contrast - 1.0) < _ODD)
-    number = good.sum(axis=1)
+    good = (used & around.inner & (np.abs(contrast - 1.0) < _ODD)).astype(float)
+    number = good.sum(axis=1, keepdims=True)
     # What noise and the cells behind the sides make of contrasts.
-    left = np.where(good, contrast, 1.0) @ around.left
-    free = np.maximum(number - around.terms.shape[1], 1)
-    scatter = np.maximum((left * left * good).sum(axis=1) / free, _SCATTER)
-    weighted = around.terms.T * (good / scatter[:, None])[:, None]
-    amounts = np.linalg.solve(weighted @ around.terms + np.diag(_BEFORE**-2), weighted @ contrast[..., None])[..., 0]
-    amounts[number < _FEWEST, 1:] = 0.0
-    # Farther out are steeper slopes of a curvature, and larger differences by a slope.
-    farther = 1.0 + 2.0 * away
-    slope = amounts[:, 1:3] @ around.of_linear / farther + amounts[:, 3:5] @ around.of_quadratic * farther
-    return amounts @ around.terms.T, slope
+    left = (1.0 + good * (contrast - 1.0)) @ around.left
+    scatter = (left * left * good).sum(axis=1, keepdims=True) / np.maximum(number - len(_BEFORE), 1.0)
+    scatter = np.maximum(scatter, _SCATTER)
+    information = good @ around.products + scatter * _PRIOR
+    amounts = np.linalg.solve(
+        information.reshape(-1, len(_BEFORE), len(_BEFORE)), ((good * contrast) @ around.terms)[..., None]
+    )[..., 0]
+    amounts[:, 1:] *= number >= _FEWEST
+    return np.asarray(amounts @ around.drawn)
