@@ -11,7 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.core.geometry.camera import ImagePoints, inverse_2x2
-from thermal_fiducial.core.geometry.se3 import perspective
+from thermal_fiducial.core.geometry.planar_pose import ippe_square
+from thermal_fiducial.core.geometry.reprojection import marker_corners
+from thermal_fiducial.core.geometry.se3 import apply, perspective
 from thermal_fiducial.core.types import FloatArray
 
 # Standard deviation of the two constraints, by the cut of markers and by lens calibrations.
@@ -58,7 +60,7 @@ def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squ
     """Displacements of corners with the constraint of a square.
 
     Two planar poses of a small square look almost alike. The one nearer to the initial corners, translated, is taken
-    unless the image rules it out.
+    unless the image rules it out; then the nearest one of those begun at the seen corners and at their two poses.
 
     Parameters
     ----------
@@ -66,13 +68,25 @@ def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squ
     seen, covariance : (N, 8, 1), (N, 8, 8) measured displacements of the corners [px]
     """
     nearest = _corrected(at, _TOGETHER @ seen, seen, covariance)
-    refuted = np.flatnonzero(nearest.chi2 > _INCONSISTENT)
-    if len(refuted):
-        other = _corrected(at.only(refuted), seen[refuted], seen[refuted], covariance[refuted])
+    # Linearised away from a square, the constraints miss that they fold where small squares are seen from in front.
+    # Both poses of the seen corners are squares to begin at.
+    for pose in (None, 0, 1):
+        refuted = np.flatnonzero(nearest.chi2 > _INCONSISTENT)
+        if len(refuted) == 0:
+            break
+        points, off = at.only(refuted), seen[refuted]
+        other = _corrected(points, off if pose is None else _square_of(points, off, pose), off, covariance[refuted])
         better = other.chi2 < nearest.chi2[refuted]
         for mine, its in zip(nearest, other, strict=True):
             mine[refuted[better]] = its[better]
     return nearest
+
+
+def _square_of(at: ImagePoints, seen: FloatArray, pose: int) -> FloatArray:
+    """Displacements (N, 8, 1) to the squares in one of the two planar poses of the seen corners [px]."""
+    T = ippe_square(at.x + (at.inverse @ seen.reshape(-1, 4, 2, 1))[..., 0], np.ones(len(seen)))[:, pose]
+    corners = apply(T, marker_corners(1.0))
+    return np.asarray(at.J @ (corners[..., :2] / corners[..., 2:] - at.x)[..., None]).reshape(-1, 8, 1)
 
 
 def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance: FloatArray) -> Squared:
