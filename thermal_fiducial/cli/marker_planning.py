@@ -31,8 +31,9 @@ from thermal_fiducial.files.writing import new_file
 _PITCH_MM = 0.017
 _FADE_SECONDS = (0.0, 30.0, 60.0, 120.0, 300.0, 900.0, 3600.0)
 _STAND_OFFS_MM = (0.0, 0.5, 2.0, 5.0, 10.0, 20.0)
-# Sides [px] from the detector's min_side_px to a marker that fills the image; contrasts in NETD.
-_SIDES_PX = (12.0, 13.0, 15.0, 17.0, 20.0, 24.0, 30.0, 40.0, 60.0, 100.0, 160.0)
+# Sides [px] from the detector's min_side_px to a marker that fills the image, closer where tilted markers change from
+# one fit to the other; contrasts in NETD.
+_SIDES_PX = (12.0, 13.0, 15.0, 17.0, 20.0, 24.0, 30.0, 34.0, 40.0, 60.0, 100.0, 160.0)
 _CONTRASTS = (1.0, 2.0, 4.0, 8.0, 20.0, 80.0, 300.0)
 _TILTS_DEG = (0.0, 30.0, 45.0, 55.0, 65.0, 75.0)
 

@@ -22,13 +22,14 @@ class SystematicErrors:
     #: Corners [px]: model of the lens and bias of the detector, which last as long as the view. To begin with what a
     #: published calibration leaves of a board of 36 tags (means over cells of 60 px: 0.08 and 0.09 px; body poses from
     #: two cameras differ by 6.6 mm, NEES 2.4 without it, 0.9 with it, correlation 0.86 after 0.1 s, 0.36 after 4 s);
-    #: learned in flight from residuals that last (``CornerBias``). Enters poses from markers (:func:`corners_of_pose`).
+    #: learned in flight from residuals that last (``CornerBias``). Enters poses from markers (:func:`corners_of_pose`);
+    #: map and new markers by draws (``lens_errors``).
     corner_px: float = 0.1
     #: Distance over which that error stays the same [share of the image's width]: a lens model is wrong by a smooth
     #: function. On the same board lengths of 0.1 to 0.25 fit, 0.5 leaves NEES 1.1, 1.0 leaves 1.25.
     corner_length: float = 0.25
-    #: Corners [px] where one hypothesis is weighed against another. Enters the fit of new markers, the choice between
-    #: two poses, and weights by the map.
+    #: Corners [px] where one hypothesis is weighed against another. Enters the weights of views of new markers, the
+    #: choice between two poses, and weights by the map.
     decision_px: float = 0.1
     #: Common relative error of the markers' sides: ways of measuring tags on one carpet differ by 1.2 %, a laser
     #: cutter's kerf of 0.3 mm is 0.1 %. Enters poses from markers (:func:`of_single_error`) and the map
