@@ -116,8 +116,12 @@ class PatternFit(NamedTuple):
 
 
 def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> BoolArray:
-    """Which markers (N, 4, 2) have sides that are not measured by themselves, for a blur of the optics [px]."""
-    return np.asarray(sides_px(corners_px) < _NARROW * blur_px * cells)
+    """Which markers (N, 4, 2) have sides that are not measured by themselves, for a blur of the optics [px].
+
+    Of a marker that is turned away the cells are narrow along one direction only, and that is what counts.
+    """
+    narrowest = np.sqrt(squared_sides(corners_px).min(axis=1))
+    return np.asarray(narrowest < _NARROW * blur_px * cells)
 
 
 def fitted_patterns(
