@@ -80,8 +80,7 @@ def noise_of_pose(gains: FloatArray, covariances: FloatArray, chi2: float) -> Fl
     covariances : (n, 2, 2) [px^2]
     chi2 : of the residuals
     """
-    white = np.tensordot(gains, covariances @ np.swapaxes(gains, -1, -2), axes=([0, 2], [0, 1]))
-    return noise_factor(chi2, 2 * len(gains) - 6) * white
+    return noise_factor(chi2, 2 * len(gains) - 6) * independent_sum(gains, covariances)
 
 
 def noise_factor(chi2: float, freedom: int) -> float:
@@ -140,21 +139,6 @@ def map_of_pose(
     A = lever_arm(arms)
     common = MAP_COMMON * A @ positive(covariances[best]) @ np.swapaxes(A, -1, -2)
     return np.asarray(common[-1] + correlated_sum(gains, positive(covariances - common[:-1])))
-
-
-def of_draws(gains: FloatArray, draws: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of a camera pose by joint ``draws`` (N, 6, K) of the errors of N markers.
-
-    Parameters
-    ----------
-    gains : (N, 6, 6) derivative of the pose by the pose of each marker
-    """
-    return covariance_of(np.tensordot(gains, draws, axes=([0, 2], [0, 1])))
-
-
-def covariance_of(draws: FloatArray) -> FloatArray:
-    """Covariances (..., m, m) of draws (..., m, K) of errors whose mean is zero."""
-    return np.asarray(draws @ np.swapaxes(draws, -1, -2) / draws.shape[-1])
 
 
 def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
@@ -246,6 +230,21 @@ def with_corner_errors(covariances: FloatArray, errors: SystematicErrors) -> Flo
 
 
 # Helpers.
+
+
+def independent_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Covariance (m, m) of ``sum_i gains_i x_i`` of independent ``x_i``: gains (n, m, p), covariances (n, p, p)."""
+    return np.asarray(np.tensordot(gains, covariances @ np.swapaxes(gains, -1, -2), axes=([0, 2], [0, 1])))
+
+
+def drawn_sum(gains: FloatArray, draws: FloatArray) -> FloatArray:
+    """Draws (m, K) of ``sum_i gains_i x_i`` by joint draws of the ``x_i``: gains (n, m, p), draws (n, p, K)."""
+    return np.asarray(np.tensordot(gains, draws, axes=([0, 2], [0, 1])))
+
+
+def covariance_of(draws: FloatArray) -> FloatArray:
+    """Covariances (..., m, m) of draws (..., m, K) of errors whose mean is zero."""
+    return np.asarray(draws @ np.swapaxes(draws, -1, -2) / draws.shape[-1])
 
 
 def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -14,12 +14,13 @@ from thermal_fiducial.core.error_model import (
     corner_correlations,
     corners_of_pose,
     correlated_sum,
+    covariance_of,
     decision_weights,
+    drawn_sum,
     map_of_pose,
     map_weights,
     noise_factor,
     noise_of_pose,
-    of_draws,
     of_single_error,
     positive,
     scale_of_map,
@@ -135,8 +136,8 @@ class _JointFit:
     ) -> Location | None:
         """The pose (4, 4) corrected by ``step`` (6,), with its covariance; None if that is not finite.
 
-        The covariance is the sum of white corner noise, scaled up to the residuals, of errors of the map's markers with
-        unknown correlations, and of systematic errors of corners and scale by the error model.
+        The covariance is the sum of white corner noise, scaled up to the residuals, of errors of the map's markers, and
+        of systematic errors of corners and scale by the error model.
 
         Parameters
         ----------
@@ -175,12 +176,12 @@ class _JointFit:
         By joint draws, where the markers have them; how the errors of the others are correlated is not known.
         """
         sight, others = self.sight, ~self.sight.drawn
-        joint = of_draws(gains, sight.draws)
+        rest = sight.map_covariances - scale_of_map(sight.scale_arms, self.model)
+        if others.any() and not sight.draws.any():
+            return map_of_pose(gains, rest, sight.T_map_marker[:, :3, 3], camera_position)
+        joint = covariance_of(drawn_sum(gains, sight.draws))
         if not others.any():
             return joint
-        rest = sight.map_covariances - scale_of_map(sight.scale_arms, self.model)
-        if not sight.draws.any():
-            return map_of_pose(gains, rest, sight.T_map_marker[:, :3, 3], camera_position)
         return bounded_sum(np.stack([joint, correlated_sum(gains[others], positive(rest[others]))]))
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:

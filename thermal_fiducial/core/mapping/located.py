@@ -9,6 +9,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import (
     arms_of_scale,
     correlated_sum,
+    drawn_sum,
     DRAWS,
     INCONSISTENT_PX,
     positive,
@@ -142,8 +143,7 @@ class Location:
             relative = self.noise + correlated_sum(self.map_gains, positive(of_map - best))
             return Viewpoint.known(pose.T_map_camera, relative, positive(pose.covariance - relative))
         of_lens = LensErrors(sight.observed.corners.reshape(-1, 2), self.camera, self.model)
-        draws = np.tensordot(self.corner_gains, of_lens.drawn(), axes=([0, 2], [0, 1]))
-        draws += np.tensordot(self.map_gains, sight.draws, axes=([0, 2], [0, 1]))
+        draws = drawn_sum(self.corner_gains, of_lens.drawn()) + drawn_sum(self.map_gains, sight.draws)
         return Viewpoint.known(pose.T_map_camera, self.noise, self.of_scale, draws)
 
 

@@ -5,7 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import correlated_sum, covariance_of, DRAWS, SystematicErrors, with_corner_errors
+from thermal_fiducial.core.error_model import (
+    correlated_sum,
+    covariance_of,
+    drawn_sum,
+    DRAWS,
+    independent_sum,
+    SystematicErrors,
+    with_corner_errors,
+)
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import linearise
 from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
@@ -87,12 +95,10 @@ class FittedPoses:
     camera_covariances: FloatArray
     common: FloatArray
     draws: FloatArray | None
-    #: (n, 8, 8) by which residuals became white; (n, 8, 8), (n, 6, 6) noise of corners [px^2] and cameras, and
-    #: (n, 8, K) draws of the errors of the lens at the corners [px]
+    #: (n, 8, 8) by which residuals became white; (n, 8, 8) noise of the corners [px^2], and errors of the lens there
     W: FloatArray
     corner_noise: FloatArray
-    camera_noise: FloatArray
-    of_lens: FloatArray
+    of_lens: LensErrors
 
     def errors(self, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray | None]:
         """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error where the cameras' errors have some.
@@ -105,9 +111,10 @@ class FittedPoses:
         if self.draws is None:
             return noise * white + of_common + correlated_sum(gains, self.camera_covariances), None
         by_corner = white @ np.swapaxes(self.J_marker, -1, -2) @ self.W
-        shared = np.tensordot(gains, self.draws, axes=([0, 2], [0, 1]))
-        shared += np.tensordot(by_corner, self.of_lens, axes=([0, 2], [0, 1]))
-        own = noise * (_summed(by_corner, self.corner_noise) + _summed(gains, self.camera_noise))
+        of_lens = self.of_lens.drawn().reshape(-1, 8, DRAWS)
+        shared = drawn_sum(gains, self.draws) + drawn_sum(by_corner, of_lens)
+        own = independent_sum(by_corner, self.corner_noise) + independent_sum(gains, self.camera_covariances)
+        own *= noise
         of_noise = np.linalg.cholesky(own) @ rng.standard_normal((6, DRAWS))
         return own + of_common + covariance_of(shared), shared + of_noise
 
@@ -128,13 +135,14 @@ class MarkerViews:
 
     def __init__(self, views: Sequence[MarkerView], size: float, camera: Camera, errors: SystematicErrors) -> None:
         self._camera, self._size = camera, size
-        self._corners = np.stack([view.corners for view in views]).reshape(-1, 8)
-        self._errors = errors
-        covariances = self._corner_covariances = np.stack([view.corner_covariances for view in views])
-        self._noise = with_corner_errors(covariances, SystematicErrors())
+        corners = np.stack([view.corners for view in views])
+        self._corners, self._of_lens = corners.reshape(-1, 8), LensErrors(corners, camera, errors)
+        covariances = np.stack([view.corner_covariances for view in views])
+        self._noise = _of_views(covariances)
+        #: with the bias of the corners, for weights and decisions
+        self._uncertain = _of_views(with_corner_errors(covariances, SystematicErrors()))
         self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
-        self._covariances = np.stack([view.viewpoint.covariances for view in views])
-        self._camera_noise = self._covariances
+        self._camera_noise = self._covariances = np.stack([view.viewpoint.covariances for view in views])
         self._common = np.stack([view.viewpoint.common for view in views])
         draws = [view.viewpoint.draws for view in views if view.viewpoint.draws is not None]
         self._draws = np.stack(draws) if len(draws) == len(views) else None
@@ -158,24 +166,14 @@ class MarkerViews:
                 break
         cost = chi2 + np.sum(begun.log_determinants, axis=-1)
         order = np.argsort(cost, kind='stable')
-        best, T_map_camera, covariances = order[0], *self._cameras(used)
+        best, (T_map_camera, _) = order[0], self._cameras(used)
         _, J_camera, J_marker = self._linearised(T, T_map_camera)
-        W = begun.W[best]
+        W, own = begun.W[best], (np.arange(len(self._corners)), used[best])
         return FittedPoses(
             T[order], chi2[order], cost[order],
-            W @ J_camera[best], W @ J_marker[best], covariances[best], self._common,
-            None if self._draws is None else self._draws[np.arange(len(used[best])), used[best]],
-            W, self._corner_noise(), self._camera_noise[np.arange(len(used[best])), used[best]],
-            LensErrors(self._corners.reshape(-1, 4, 2), self._camera, self._errors).drawn().reshape(-1, 8, DRAWS),
+            W @ J_camera[best], W @ J_marker[best], self._camera_noise[own], self._common,
+            None if self._draws is None else self._draws[own], W, self._noise, self._of_lens,
         )  # fmt: skip
-
-    def _corner_noise(self) -> FloatArray:
-        """Covariances (n, 8, 8) of the corners' noise [px^2]."""
-        noise = np.zeros((len(self._corners), 8, 8))
-        for corner in range(4):
-            both = slice(2 * corner, 2 * corner + 2)
-            noise[:, both, both] = self._corner_covariances[:, corner]
-        return noise
 
     def _choose(self, T: FloatArray) -> IntArray:
         """The likelier of the two camera poses of each view, (S, n), for a marker at T."""
@@ -208,10 +206,7 @@ class MarkerViews:
         r, J_camera, _ = self._linearised(T, T_map_camera)
         possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(-1, -2))
         J_sound = np.where(possible[..., None, None], J_camera, 0.0)
-        C = J_sound @ covariances @ np.swapaxes(J_sound, -1, -2)
-        for corner in range(4):
-            both = slice(2 * corner, 2 * corner + 2)
-            C[..., both, both] += self._noise[:, corner]
+        C = J_sound @ covariances @ np.swapaxes(J_sound, -1, -2) + self._uncertain
         L = np.linalg.cholesky(C)
         log_determinants = 2.0 * np.sum(np.log(np.einsum('...ii->...i', L)), axis=-1)
         log_determinants = np.where(possible, log_determinants, np.inf)
@@ -235,6 +230,9 @@ class MarkerViews:
         return T, np.where(possible, chi2, np.inf)
 
 
-def _summed(gains: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of a sum of independent errors: gains (n, 6, m), covariances (n, m, m)."""
-    return np.asarray(np.sum(gains @ covariances @ np.swapaxes(gains, -1, -2), axis=0))
+def _of_views(covariances: FloatArray) -> FloatArray:
+    """Covariances (n, 8, 8) of all corners of n views by those of single corners (n, 4, 2, 2)."""
+    whole = np.zeros((len(covariances), 4, 2, 4, 2))
+    each = np.arange(4)
+    whole[:, each, :, each] = np.swapaxes(covariances, 0, 1)
+    return whole.reshape(-1, 8, 8)

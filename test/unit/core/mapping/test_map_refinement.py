@@ -281,37 +281,45 @@ def test_odometry_holds_keyframes_that_a_marker_leaves_loose():
     assert np.sqrt(np.mean(off**2)) < 0.1 * 0.5
 
 
-def test_errors_that_last_are_in_the_covariances():
-    """Corners that are off by the same in all views of a marker, and by nothing else."""
+def nees_of_lasting(sources, drawn):
+    """Mean NEES (six degrees of freedom) of twenty maps whose corners are off by ``drawn``, as ``sources`` claim.
+
+    ``drawn(rng)`` are the errors of keyframes whose corners are exact otherwise.
+    """
     poses, nees = wall(np.random.default_rng(0)), []
     exact = snapshot(np.random.default_rng(1), poses, sigma=0.0, disturbance=0.0)
-    shape = replace(NO_SYSTEMATIC_ERRORS, marker_shape=1.0)
-    white, both = (refine(replace(exact, errors=errors)).markers for errors in (NO_SYSTEMATIC_ERRORS, shape))
+    white, both = (refine(replace(exact, errors=errors)).markers for errors in (NO_SYSTEMATIC_ERRORS, sources))
     P = np.stack([both[i].covariance - white[i].covariance for i in range(1, 8)])
     for seed in range(20):
-        # Corners of noiseless rows declare 1e-3 px.
-        off = 1e-3 * np.random.default_rng(seed).normal(size=(8, 4, 2))
-        frames = tuple(replace(frame, corners=frame.corners + off[frame.ids]) for frame in exact.keyframes)
+        off = drawn(np.random.default_rng(seed))
+        frames = tuple(replace(frame, corners=frame.corners + off(frame)) for frame in exact.keyframes)
         d = errors(refine(replace(exact, keyframes=frames)), poses)
         nees.append(np.mean(np.einsum('ni,nij,nj->n', d, np.linalg.inv(P), d)))
+    return np.mean(nees)
+
+
+def test_errors_that_last_are_in_the_covariances():
+    """Corners that are off by the same in all views of a marker, and by nothing else."""
+
+    def shapes(rng):
+        # Corners of noiseless rows declare 1e-3 px.
+        off = 1e-3 * rng.normal(size=(8, 4, 2))
+        return lambda frame: off[frame.ids]
+
+    nees = nees_of_lasting(replace(NO_SYSTEMATIC_ERRORS, marker_shape=1.0), shapes)
     # Six, or 64 / 57 times that (the mean of an inverted Wishart matrix of 64 samples). A map's markers share most
     # of their error: the mean of twenty has a standard deviation of 0.9.
-    assert 6.0 - 2.7 < np.mean(nees) < 6.0 * 64 / 57 + 2.7
+    assert 6.0 - 2.7 < nees < 6.0 * 64 / 57 + 2.7
 
 
 def test_a_lens_that_is_wrong_is_in_the_covariances():
-    poses, nees = wall(np.random.default_rng(0)), []
-    exact = snapshot(np.random.default_rng(1), poses, sigma=0.0, disturbance=0.0)
-    lens = replace(NO_SYSTEMATIC_ERRORS, corner_px=0.1)
-    white, both = (refine(replace(exact, errors=errors)).markers for errors in (NO_SYSTEMATIC_ERRORS, lens))
-    P = np.stack([both[i].covariance - white[i].covariance for i in range(1, 8)])
-    for seed in range(20):
-        off = drawn_lens(np.random.default_rng(seed), 0.1)
-        frames = tuple(replace(frame, corners=frame.corners + off(frame.corners)) for frame in exact.keyframes)
-        d = errors(refine(replace(exact, keyframes=frames)), poses)
-        nees.append(np.mean(np.einsum('ni,nij,nj->n', d, np.linalg.inv(P), d)))
+    def lens(rng):
+        off = drawn_lens(rng, 0.1)
+        return lambda frame: off(frame.corners)
+
+    nees = nees_of_lasting(replace(NO_SYSTEMATIC_ERRORS, corner_px=0.1), lens)
     # Six. The markers share the lens: the means of single maps scatter by 2.5, their mean by 0.6.
-    assert 6.0 - 1.8 < np.mean(nees) < 6.0 + 1.8
+    assert 6.0 - 1.8 < nees < 6.0 + 1.8
 
 
 def test_draws_say_how_the_errors_of_markers_are_correlated():
