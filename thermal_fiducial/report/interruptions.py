@@ -58,6 +58,11 @@ class Interruption:
         """Whether it is a flat-field correction of the camera, which is normal operation."""
         return self.cause is Cause.SHUTTER
 
+    @property
+    def is_drop_out(self) -> bool:
+        """Whether it is neither normal operation nor the time before the filter had started."""
+        return not (self.is_shutter or self.before_start)
+
 
 def interruptions(run: Run, fused_errors: Errors | None) -> list[Interruption]:
     """Gaps of the poses from markers above :data:`GAP_NS`, and shorter ones caused by the shutter.

@@ -100,7 +100,7 @@ def _shutter(evaluation: Evaluation) -> Card | None:
 def _drop_outs(evaluation: Evaluation) -> Card | None:
     if not len(evaluation.run.fiducial):
         return None
-    others = [entry for entry in evaluation.interruptions if not (entry.is_shutter or entry.before_start)]
+    others = [entry for entry in evaluation.interruptions if entry.is_drop_out]
     if not others:
         return Card('Drop-outs', '0', '', 'no other time over 0.3 s without markers')
     longest = max(entry.seconds for entry in others)

@@ -141,7 +141,7 @@ def _steps(numbers: dict[str, Any]) -> Remark | None:
 
 def _interruptions(evaluation: Evaluation) -> list[Remark]:
     shutter = [entry for entry in evaluation.interruptions if entry.is_shutter]
-    others = [entry for entry in evaluation.interruptions if not (entry.is_shutter or entry.before_start)]
+    others = [entry for entry in evaluation.interruptions if entry.is_drop_out]
     late = [entry for entry in evaluation.interruptions if entry.before_start]
     remarks = []
     if shutter:

@@ -35,10 +35,8 @@ from thermal_fiducial.sim.lens import Lens
 SMALL = Lens((382.0, 381.0), (161.0, 126.0), width=320, height=256)
 
 
-def test_camera_against_imu(tmp_path, capsys):
-    bag = recording(seconds=4.2).write(tmp_path / 'bag')
-    marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
-    out = tmp_path / 'extrinsics.yaml'
+def calibrated(bag, marker_map, out):
+    """Parameters that ``calibrate camera-imu`` finds from four seconds, with the right rotation and clock."""
     assert main(['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--out', str(out)]) == 0
     found = yaml.safe_load(out.read_text())['/**']['ros__parameters']
     R = se3.rotation_from_quaternion(found['camera_orientation'])
@@ -46,6 +44,13 @@ def test_camera_against_imu(tmp_path, capsys):
     assert np.degrees(se3.rotation_angle(R.T @ T_BODY_CAMERA[:3, :3])) < 1.0
     # These frames have no lag, but the detector undoes the 10 ms that a bolometer has.
     assert 0.0 < found['camera_time_offset'] < 0.02
+    return found
+
+
+def test_camera_against_imu(tmp_path, capsys):
+    bag = recording(seconds=4.2).write(tmp_path / 'bag')
+    marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
+    found = calibrated(bag, marker_map, tmp_path / 'extrinsics.yaml')
     printed = capsys.readouterr()
     assert '+-' in printed.out
     # What the recording leaves open goes on to the filter, which would otherwise take 2 mm and 2 mrad.
@@ -75,13 +80,7 @@ def with_corners_instead_of_images(images, marker_map):
 def test_camera_against_imu_by_recorded_corners(tmp_path):
     marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
     bag = with_corners_instead_of_images(recording(seconds=4.2), marker_map).write(tmp_path / 'bag')
-    out = tmp_path / 'extrinsics.yaml'
-    assert main(['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--out', str(out)]) == 0
-    found = yaml.safe_load(out.read_text())['/**']['ros__parameters']
-    R = se3.rotation_from_quaternion(found['camera_orientation'])
-    # As with the images: see above.
-    assert np.degrees(se3.rotation_angle(R.T @ T_BODY_CAMERA[:3, :3])) < 1.0
-    assert 0.0 < found['camera_time_offset'] < 0.02
+    calibrated(bag, marker_map, tmp_path / 'extrinsics.yaml')
 
 
 def test_camera_against_imu_names_the_dictionary_that_no_frame_shows(tmp_path, capsys):
