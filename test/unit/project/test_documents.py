@@ -66,6 +66,20 @@ def test_links_lead_to_files(page):
     assert missing == []
 
 
+def test_the_list_of_decisions_has_each_once_and_says_what_revises_it():
+    records = sorted((ROOT / 'doc' / 'decisions').glob('[0-9]*.md'))
+    lines = (ROOT / 'doc' / 'decisions' / 'index.md').read_text(encoding='utf-8').splitlines()
+    listed = {line.split('](')[1].split(')')[0]: line for line in lines if line.startswith('- [')}
+    assert sorted(listed) == [record.name for record in records]
+    assert len(listed) == sum(line.startswith('- [') for line in lines)
+    for record in records:
+        title, _, opening = record.read_text(encoding='utf-8').split('\n', 3)[:3]
+        assert f'[{title.removeprefix("# ")}]' in listed[record.name]
+        if re.match('Revises|Supersedes|Replaces', opening):
+            first = re.search(r'\]\((\d{4}-[^)]+)\)', opening)
+            assert f'({record.name})' in listed[first[1]].split('; revised by')[1]
+
+
 def shown(program):
     """Words after ``program`` of each line of the documents that runs it."""
     found = []
