@@ -313,12 +313,6 @@ class ClockParameters(SelfChecked):
     camera_time_offset: float = param(
         0.0, 'Clock offset of the camera, t_imu = t_camera + offset.', unit='s', minimum=-1.0, maximum=1.0
     )
-
-
-@dataclass(frozen=True)
-class UncertainClockParameters(ClockParameters):
-    """The same, and how well it is known."""
-
     time_offset_std: float = param(
         0.03,
         'Standard deviation of camera_time_offset: prior if it is estimated, else noise of each pose.',
@@ -534,9 +528,7 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
 
 
 @dataclass(frozen=True)
-class MarkerMapperConfig(
-    ImageRateParameters, UncertainClockParameters, FrameParameters, MountParameters, MarkerParameters
-):
+class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, MountParameters, MarkerParameters):
     """The incremental marker map."""
 
     map_file: str = param('', 'Marker map (YAML). Empty: no map.', path=True)
@@ -646,7 +638,7 @@ class ImuNoise(SelfChecked):
 
 
 @dataclass(frozen=True)
-class PoseEkfConfig(ScheduleParameters, UncertainClockParameters, FrameParameters, MountParameters):
+class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountParameters):
     """The filter."""
 
     estimate_time_offset: bool = param(True, 'Estimate the error of camera_time_offset.')

@@ -88,7 +88,7 @@ class MarkerDetector:
         """
         camera.require_size_of(counts)
         config, known, history = self.config, self._known, self._history
-        prediction = predict_frame(stamp_ns, prior, history.track, config.max_odometry_age)
+        prediction = predict_frame(stamp_ns, prior, history.track, config.max_odometry_age, config.time_offset_std)
         T_camera_map = prediction.T_camera_map
         keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
         frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)

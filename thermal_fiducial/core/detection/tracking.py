@@ -9,7 +9,6 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.detection.frame import LEAST_DEPTH
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.twist import (
@@ -38,8 +37,6 @@ _COORDINATES = 8
 _LAGS_BEFORE, _STATES, _SHORTEST_LAG_NS = 3, 10, 5_000_000
 # Fewest states of that, since the noise of a gyroscope averages out; else those of so long before the frame [ns].
 _FEWEST, _LONGEST_NS = 4, 100_000_000
-# Standard deviation of the clock offset before the filter has estimated it [s]: the filter's own prior.
-_UNKNOWN_CLOCK_S = PoseEkfConfig().time_offset_std
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,16 +161,21 @@ class FramePrediction:
     position_std_m: float
 
 
-def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, max_age_s: float) -> FramePrediction:
+def predict_frame(
+    stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, max_age_s: float, time_offset_std: float
+) -> FramePrediction:
     """Prediction of a frame at ``stamp_ns``, in the camera's clock, from odometry and the last frames' markers.
 
-    Odometry older than ``max_age_s`` gives no pose.
+    Parameters
+    ----------
+    max_age_s : age beyond which odometry gives no pose
+    time_offset_std : standard deviation of the clock offset before the filter has estimated it [s]
     """
     if prior is None:
         return FramePrediction(track.predict(stamp_ns), None, math.inf)
     lag_ns = max(round(SECOND_NS * track.lag), _SHORTEST_LAG_NS)
     odometry_ns = prior.in_odometry_clock(stamp_ns)
-    clock_std_s = 0.0 if prior.clock_is_known else _UNKNOWN_CLOCK_S
+    clock_std_s = 0.0 if prior.clock_is_known else time_offset_std
     states = prior.between(odometry_ns - _LAGS_BEFORE * lag_ns, odometry_ns + lag_ns, _STATES)
     if len(states) < _FEWEST:
         states = prior.between(odometry_ns - _LONGEST_NS, odometry_ns + lag_ns, _STATES)

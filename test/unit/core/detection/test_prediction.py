@@ -28,8 +28,8 @@ def states(offset_s=0.0):
     return found
 
 
-def predicted(prior):
-    return predict_frame(STAMP_NS, prior, MotionTrack.of_rig(np.eye(4), 0.010), 0.2)
+def predicted(prior, time_offset_std=0.03):
+    return predict_frame(STAMP_NS, prior, MotionTrack.of_rig(np.eye(4), 0.010), 0.2, time_offset_std)
 
 
 @pytest.mark.parametrize('offset_s', [0.0, -0.060, 0.035])
@@ -68,6 +68,9 @@ def test_an_unknown_clock_offset_widens_the_predicted_motion_and_pose():
     known, unknown = (predicted(motion_prior(*states(), clock_offset=offset)) for offset in (0.0, None))
     # 30 ms of the offset at 2 m/s, and at 3 m/s^2; the acceleration itself is known to a few m/s^2.
     assert unknown.position_std_m == pytest.approx(np.hypot(known.position_std_m, 0.06), rel=1e-6)
+    # A clock that the rig's file says is known to a millisecond.
+    calibrated = predicted(motion_prior(*states(), clock_offset=None), time_offset_std=0.001)
+    assert calibrated.position_std_m == pytest.approx(np.hypot(known.position_std_m, 0.002), rel=1e-6)
     assert np.sqrt(known.twist.covariance[0, 0]) < 0.02
     assert 0.08 < np.sqrt(unknown.twist.covariance[0, 0]) < 0.3
 
