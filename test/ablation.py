@@ -163,7 +163,7 @@ def _place(path: str) -> Any:
 
 
 def _nothing_found(*_: Any) -> Any:
-    return _place('known_markers:FoundMarkers').none()
+    return _place('prediction.known_markers:FoundMarkers').none()
 
 
 def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
@@ -171,9 +171,9 @@ def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
     return _place('corners.squares:Squared')(seen, covariance, none, none, none)
 
 
-_READOUT = tuple(f'frame:{name}' for name in ('delays', 'stretch', 'displacement', 'rolling_displacement'))
-_SCALES = _place('search:SearchScales')
-_ALL_IN_THE_SEARCH = {'finding:_next_scales': lambda *_, **__: _SCALES.ALL}
+_READOUT = tuple(f'prediction.frame:{name}' for name in ('delays', 'stretch', 'displacement', 'rolling_displacement'))
+_SCALES = _place('finding.search:SearchScales')
+_ALL_IN_THE_SEARCH = {'finding.finder:_next_scales': lambda *_, **__: _SCALES.ALL}
 _DISPLAYED = 'confirmation:DisplayedSides', 'confirmation:_outward'
 _BORDER_WIDTH = {'confirmation:DisplayedSides.corrected': lambda _, __, refined, ___: refined.corners}
 
@@ -183,7 +183,7 @@ MECHANISMS = {
     ),
     'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_INCONSISTENT': np.inf}),
     'passes until settled': Mechanism('fast, 8 K, blind', (), {'corners.side_fit:_PASSES': 1}),
-    'second round': Mechanism('fast, 8 K, blind', (), {'refining:_ROUNDS': 1}),
+    'second round': Mechanism('fast, 8 K, blind', (), {'corners.refining:_ROUNDS': 1}),
     'edges behind the sides': Mechanism(
         'fast, 8 K, blind',
         ('corners.sides:_of_cells',),
@@ -191,44 +191,50 @@ MECHANISMS = {
     ),
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
-    'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'frame:_HARDLY_PX': np.inf}),
+    'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'prediction.frame:_HARDLY_PX': np.inf}),
     'ends of motion blur': Mechanism(
         'fast, 8 K, guided',
-        ('frame:_moments', 'frame:_halves'),
+        ('prediction.frame:_moments', 'prediction.frame:_halves'),
         {'corners.side_fit:WITHOUT_TAIL': _place('corners.sides:ONE_GAUSSIAN')},
     ),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(
-        'fast, 8 K, blind', (), {'corner_errors:OF_LAG': 0.0, 'corner_errors:OF_LAG_FORM': 0.0}
+        'fast, 8 K, blind', (), {'corners.corner_errors:OF_LAG': 0.0, 'corners.corner_errors:OF_LAG_FORM': 0.0}
     ),
     'partially visible markers': Mechanism(
-        'landing', ('partial', 'visible_cells', 'corners.grid'), {'detector:_ENOUGH_WHOLE': 0}
+        'landing', ('partial.partial_markers', 'partial.visible_cells', 'partial.grid'), {'detector:_ENOUGH_WHOLE': 0}
     ),
     'width of borders, slow': Mechanism('8 bits, slow', _DISPLAYED, _BORDER_WIDTH),
     'width of borders, fast': Mechanism('8 bits, fast', _DISPLAYED, _BORDER_WIDTH),
     'width of borders, carpet': Mechanism('carpet', _DISPLAYED, _BORDER_WIDTH),
-    'polarity': Mechanism('slow, 8 K, blind', ('finding:FrameHistory.polarities',), {}, {'polarity': 'any'}),
-    'half resolution': Mechanism('slow, 0.5 K, blind', (), {'finding:_next_scales': lambda *_, **__: _SCALES.FINE}),
+    'polarity': Mechanism('slow, 8 K, blind', ('finding.finder:FrameHistory.polarities',), {}, {'polarity': 'any'}),
+    'half resolution': Mechanism(
+        'slow, 0.5 K, blind', (), {'finding.finder:_next_scales': lambda *_, **__: _SCALES.FINE}
+    ),
     'one resolution in turn': Mechanism('slow, 8 K, blind', (), _ALL_IN_THE_SEARCH),
     'outlines pulled onto patterns': Mechanism(
-        'slow, 0.1 K, blind', ('pattern_fit:aligned',), {'search:_rough': lambda *_: np.zeros(0, dtype=np.intp)}
+        'slow, 0.1 K, blind',
+        ('corners.pattern_fit:aligned',),
+        {'finding.search:_rough': lambda *_: np.zeros(0, dtype=np.intp)},
     ),
     'markers in plates': Mechanism(
         'fast, 0.5 K, blind',
-        ('patterns:shrunk', 'search:_with_shrunk'),
-        {'search:_with_shrunk': lambda quads, _: quads},
+        ('patterns:shrunk', 'finding.search:_with_shrunk'),
+        {'finding.search:_with_shrunk': lambda quads, _: quads},
     ),
     'large markers halved': Mechanism('landing', ('confirmation:_read',), {'confirmation:_WIDE_CELL_PX': np.inf}),
-    'columns of the frame': Mechanism('slow, 0.1 K, guided', (), {'frame:without_columns': lambda counts, _: counts}),
+    'columns of the frame': Mechanism(
+        'slow, 0.1 K, guided', (), {'prediction.frame:with_columns_corrected': lambda counts, _: counts}
+    ),
     'following': Mechanism(
         'slow, 0.1 K, blind',
-        ('finding:followed',),
-        {'finding:followed': _nothing_found},
+        ('finding.finder:followed',),
+        {'finding.finder:followed': _nothing_found},
     ),
     'search near predictions': Mechanism(
         'fast, 0.5 K, guided',
-        ('finding:near_prediction', 'finding:_shifted'),
-        {'finding:near_prediction': _nothing_found},
+        ('finding.finder:near_prediction', 'finding.finder:_shifted'),
+        {'finding.finder:near_prediction': _nothing_found},
     ),
     'branches by the map': Mechanism('slow, 0.1 K, guided', (), {'detector:choose_branches': lambda poses, *_: poses}),
 }

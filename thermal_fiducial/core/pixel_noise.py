@@ -1,4 +1,4 @@
-"""Noise of the pixels of a frame, from the frame itself."""
+"""Noise of the pixels of a frame, and the fixed pattern of its columns, from the frame itself."""
 
 import math
 
@@ -6,6 +6,11 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.types import Counts, Float32Array, Gray, SIGMA_OF_MEDIAN
+
+# Columns among which one is compared with their mean.
+_COLUMNS = 9
+# Mean of Gaussian noise clipped at one standard deviation moves by the share of it within, 0.68, of a small offset.
+_CLIPPED = 1.0 / math.erf(math.sqrt(0.5))
 
 
 def pixel_noise(counts: Counts | Gray | Float32Array) -> float:
@@ -20,3 +25,18 @@ def pixel_noise(counts: Counts | Gray | Float32Array) -> float:
     difference = cv2.absdiff(np.ascontiguousarray(rows[:count]), np.ascontiguousarray(below[:count])).ravel()
     middle = difference.size // 2
     return max(float(np.partition(difference, middle)[middle]) * SIGMA_OF_MEDIAN / math.sqrt(2.0), 0.5)
+
+
+def with_columns_corrected(counts: Float32Array, noise: float) -> Float32Array:
+    """``counts`` without the fixed-pattern offsets of its columns from their neighbours.
+
+    The steps from column to column, clipped at their noise so that the scene has little influence, add up to the
+    pattern. Of their sum, only what differs between neighbouring columns is certain.
+    """
+    steps = cv2.subtract(counts[:, 1:], counts[:, :-1])
+    limit = np.float32(math.sqrt(2.0) * noise)
+    np.clip(steps, -limit, limit, out=steps)
+    offsets = np.zeros((1, counts.shape[1]), dtype=np.float32)
+    np.cumsum(_CLIPPED * cv2.reduce(steps, 0, cv2.REDUCE_AVG)[0], out=offsets[0, 1:])
+    offsets -= cv2.blur(offsets, (_COLUMNS, 1))
+    return np.subtract(counts, offsets)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corner_errors import (
+from thermal_fiducial.core.detection.corners.corner_errors import (
     BLURRED_OUT,
     OF_BENT_BLUR_PX,
     OF_BENT_SCALE_PX,
@@ -21,14 +21,14 @@ from thermal_fiducial.core.detection.corner_errors import (
     OF_BORDERS_TOGETHER,
     OF_LOCAL_PX,
 )
+from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
+from thermal_fiducial.core.detection.corners.refining import RefinedMarkers
 from thermal_fiducial.core.detection.corners.segments import measure, REACHED, Segments, UNMEASURED
 from thermal_fiducial.core.detection.corners.sides import blur_of, edges_behind_border, model, sides_of
-from thermal_fiducial.core.detection.frame import counts_of, Frame
-from thermal_fiducial.core.detection.known_markers import FoundMarkers
+from thermal_fiducial.core.detection.finding.quads import halfway, halved
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
-from thermal_fiducial.core.detection.quads import halfway, halved
-from thermal_fiducial.core.detection.refined_corners import RefinedCorners
-from thermal_fiducial.core.detection.refining import RefinedMarkers
+from thermal_fiducial.core.detection.prediction.frame import counts_of, Frame
+from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import planar_poses

@@ -6,15 +6,15 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.detection.confirmation import DisplayedSides, published
+from thermal_fiducial.core.detection.corners.refining import refine
 from thermal_fiducial.core.detection.corners.sides import edges_behind
-from thermal_fiducial.core.detection.finding import FrameHistory, MarkerFinder
-from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import among, depths, ExpectedMarkers, KnownMarkers
-from thermal_fiducial.core.detection.partial import PartialMarkerSearch
+from thermal_fiducial.core.detection.finding.finder import FrameHistory, MarkerFinder
+from thermal_fiducial.core.detection.partial.partial_markers import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, Dictionary
 from thermal_fiducial.core.detection.plates import corners_of_faces
-from thermal_fiducial.core.detection.refining import refine
-from thermal_fiducial.core.detection.tracking import MotionTrack, predict_frame
+from thermal_fiducial.core.detection.prediction.frame import Frame
+from thermal_fiducial.core.detection.prediction.known_markers import among, depths, ExpectedMarkers, KnownMarkers
+from thermal_fiducial.core.detection.prediction.tracking import MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses, solve_marker_poses

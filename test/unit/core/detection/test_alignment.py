@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.pattern_fit import aligned
+from thermal_fiducial.core.detection.corners.pattern_fit import aligned
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.files.dictionary import load_dictionary
 

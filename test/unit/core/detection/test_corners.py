@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from support.lens_planes import plane_points
 
-from thermal_fiducial.core.detection.corner_errors import OF_SIDES_PX
+from thermal_fiducial.core.detection.corners.corner_errors import OF_SIDES_PX
 from thermal_fiducial.core.detection.corners.side_fit import refine_corners
 from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.geometry import se3

@@ -9,7 +9,7 @@ from support.scenes import motion_prior
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.known_markers import KnownMarkers
+from thermal_fiducial.core.detection.prediction.known_markers import KnownMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px, Odometry

@@ -6,10 +6,11 @@ import pytest
 from support import approach
 from support.detector_scores import odometry_before
 
-from thermal_fiducial.core.detection.corner_errors import of_motion_blur, unknown_motion
+from thermal_fiducial.core.detection.corners.corner_errors import of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.corners.side_fit import refine_corners
 from thermal_fiducial.core.detection.corners.sides import edges_behind
-from thermal_fiducial.core.detection.frame import (
+from thermal_fiducial.core.detection.patterns import Decoder
+from thermal_fiducial.core.detection.prediction.frame import (
     counts_of,
     LAG_TAIL_AGE,
     lag_tail_maps,
@@ -18,8 +19,7 @@ from thermal_fiducial.core.detection.frame import (
     REMAINING,
     SPREAD,
 )
-from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.twist import Twist
+from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.measurements import corners_px
 from thermal_fiducial.files.dictionary import load_dictionary

@@ -3,9 +3,9 @@
 import numpy as np
 from support.scenes import motion_prior
 
-from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
-from thermal_fiducial.core.detection.tracking import MotionTrack, predict_frame
-from thermal_fiducial.core.detection.twist import interaction, Twist, twist_by_odometry
+from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers
+from thermal_fiducial.core.detection.prediction.tracking import MotionTrack, predict_frame
+from thermal_fiducial.core.detection.prediction.twist import interaction, Twist, twist_by_odometry
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import twist_transfer

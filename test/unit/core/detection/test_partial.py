@@ -11,12 +11,12 @@ from support.scenes import motion_prior
 
 from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corners.grid import adjusted, grid_edges, Layer
-from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import KnownMarkers
-from thermal_fiducial.core.detection.partial import PartialMarkerSearch
+from thermal_fiducial.core.detection.partial.grid import adjusted, grid_edges, Layer
+from thermal_fiducial.core.detection.partial.partial_markers import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.twist import Twist
+from thermal_fiducial.core.detection.prediction.frame import Frame
+from thermal_fiducial.core.detection.prediction.known_markers import KnownMarkers
+from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, Odometry

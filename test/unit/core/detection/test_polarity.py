@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.finding import FrameHistory
-from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
-from thermal_fiducial.core.detection.tracking import MotionTrack
+from thermal_fiducial.core.detection.finding.finder import FrameHistory
+from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers
+from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
 
 BOTH = 1.0, -1.0
 

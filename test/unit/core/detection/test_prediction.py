@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.scenes import camera_of, detector_of, motion_prior
 
-from thermal_fiducial.core.detection.tracking import MotionTrack, predict_frame
+from thermal_fiducial.core.detection.prediction.tracking import MotionTrack, predict_frame
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.sim.scenario import named
 from thermal_fiducial.sim.thermal_camera import render_frames

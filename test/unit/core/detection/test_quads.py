@@ -4,15 +4,15 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.quads import (
+from thermal_fiducial.core.detection.finding.quads import (
     dark_in_picture,
     DarkRegions,
     find_quads,
     halfway,
     halved,
     Scale,
-    without_columns,
 )
+from thermal_fiducial.core.pixel_noise import with_columns_corrected
 
 SHAPE = 240, 320
 FINE = Scale(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5)
@@ -51,7 +51,7 @@ def test_offsets_of_columns_are_removed_and_the_scene_stays():
     offsets = np.random.default_rng(1).normal(0.0, 0.5, SHAPE[1])
     scene = drawn(100.0, sigma=0.0)
     seen = (scene + noise(1.0) + offsets).astype(np.float32)
-    left = without_columns(seen, 1.0) - scene
+    left = with_columns_corrected(seen, 1.0) - scene
     columns = left.mean(axis=0)
     # A ninth of the columns' own share stays, and what they have in common: 0.28 of the offsets when written.
     assert columns.std() < 0.4 * offsets.std()

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.frame import (
+from thermal_fiducial.core.detection.prediction.frame import (
     delays,
     Frame,
     Places,
     rolling_displacement,
     stretch,
 )
-from thermal_fiducial.core.detection.twist import Twist
+from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.frame import Frame, Places
-from thermal_fiducial.core.detection.known_markers import FoundMarkers
+from thermal_fiducial.core.detection.finding.search import BlindSearch, inside_out, SearchScales
 from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
-from thermal_fiducial.core.detection.search import BlindSearch, inside_out, SearchScales
+from thermal_fiducial.core.detection.prediction.frame import Frame, Places
+from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.files.dictionary import load_dictionary

@@ -8,7 +8,7 @@ from support.close_views import BITS, BLUR_WITH_PIXEL, CAMERAS, draw, plate, pos
 
 from thermal_fiducial.core.detection.corners.segments import adjust, measure, median_of, robust_fit, UNMEASURED
 from thermal_fiducial.core.detection.corners.sides import blur_of, edges_behind, model, sides_of
-from thermal_fiducial.core.detection.frame import counts_of
+from thermal_fiducial.core.detection.prediction.frame import counts_of
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import marker_corners
 

@@ -14,9 +14,9 @@ from support.small_pictures import (
 )
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.blurred_patterns import PatternView
+from thermal_fiducial.core.detection.corners.blurred_patterns import PatternView
+from thermal_fiducial.core.detection.corners.pattern_fit import evidence_of, fit_patterns
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.pattern_fit import evidence_of, fit_patterns
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corner_covariances, corners_px

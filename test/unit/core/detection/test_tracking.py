@@ -5,7 +5,7 @@ import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.search import BlindSearch
+from thermal_fiducial.core.detection.finding.search import BlindSearch
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px
 from thermal_fiducial.files.dictionary import load_dictionary

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from thermal_fiducial.core.detection.partial.visible_cells import VisibleCells
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = load_dictionary('DICT_4X4_50').bits

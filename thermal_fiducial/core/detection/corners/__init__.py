@@ -1,1 +1,1 @@
-"""Corners from the edges of a marker, adjusted jointly."""
+"""Corners of found markers, by their sides or by their whole patterns, with their covariances."""

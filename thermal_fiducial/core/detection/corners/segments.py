@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corner_errors import (
+from thermal_fiducial.core.detection.corners.corner_errors import (
     GRADIENT_AS_CONTRAST_PX,
     OF_GRADIENT_PX2,
     OF_SIDES_PX,

@@ -8,8 +8,9 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, OF_LAG_FORM
+from thermal_fiducial.core.detection.corners.corner_errors import OF_ALL_SIDES_PX, OF_LAG_FORM
 from thermal_fiducial.core.detection.corners.reach import ending_sides, Reach
+from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.corners.segments import (
     adjust,
     measure,
@@ -22,8 +23,7 @@ from thermal_fiducial.core.detection.corners.segments import (
 from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, ONE_GAUSSIAN, reaches, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.corners.uneven_contrast import freed_of_unevenness
-from thermal_fiducial.core.detection.frame import counts_of, MotionBlur, WITHOUT_TAIL
-from thermal_fiducial.core.detection.refined_corners import RefinedCorners
+from thermal_fiducial.core.detection.prediction.frame import counts_of, MotionBlur, WITHOUT_TAIL
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corner_errors import SURFACE_FALLS
+from thermal_fiducial.core.detection.corners.corner_errors import SURFACE_FALLS
 from thermal_fiducial.core.detection.corners.segments import Segments
 from thermal_fiducial.core.detection.corners.sides import Sides
 from thermal_fiducial.core.types import BoolArray, FloatArray

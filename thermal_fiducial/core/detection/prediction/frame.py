@@ -23,10 +23,9 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.quads import without_columns
-from thermal_fiducial.core.detection.twist import interaction, Twist
+from thermal_fiducial.core.detection.prediction.twist import interaction, Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.pixel_noise import pixel_noise
+from thermal_fiducial.core.pixel_noise import pixel_noise, with_columns_corrected
 from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
 
 #: Least depth of points, used for those behind the camera [m].
@@ -101,7 +100,7 @@ class Frame:
         lag, readout = config.bolometer_lag, config.readout_time
         image = counts.astype(np.float32)
         if counts.dtype != np.uint8 and not keep_columns:
-            image = without_columns(image, noise)
+            image = with_columns_corrected(image, noise)
         return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed)
 
 

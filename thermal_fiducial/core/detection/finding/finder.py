@@ -10,8 +10,11 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.frame import Frame, Places, rolling_displacement
-from thermal_fiducial.core.detection.known_markers import (
+from thermal_fiducial.core.detection.corners.refining import CLEAR_CNR
+from thermal_fiducial.core.detection.finding.search import BlindSearch, SearchScales
+from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
+from thermal_fiducial.core.detection.prediction.frame import Frame, Places, rolling_displacement
+from thermal_fiducial.core.detection.prediction.known_markers import (
     among,
     CUT_OFF_PX,
     depths,
@@ -19,11 +22,8 @@ from thermal_fiducial.core.detection.known_markers import (
     FoundMarkers,
     KnownMarkers,
 )
-from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
-from thermal_fiducial.core.detection.refining import CLEAR_CNR
-from thermal_fiducial.core.detection.search import BlindSearch, SearchScales
-from thermal_fiducial.core.detection.tracking import MotionTrack
-from thermal_fiducial.core.detection.twist import Twist
+from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
+from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
 from thermal_fiducial.core.geometry.se3 import diagonals

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.corner_errors import OF_SIDES_PX
+from thermal_fiducial.core.detection.corners.corner_errors import OF_SIDES_PX
 from thermal_fiducial.core.detection.corners.segments import (
     measure,
     REACHED,
@@ -20,8 +20,8 @@ from thermal_fiducial.core.detection.corners.segments import (
     UNMEASURED,
 )
 from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, blurred_step, columns_across, NODES, Sides
-from thermal_fiducial.core.detection.frame import counts_of, Frame, LEAST_DEPTH, Places, rolling_displacement
 from thermal_fiducial.core.detection.plates import outlines_on_faces
+from thermal_fiducial.core.detection.prediction.frame import counts_of, Frame, LEAST_DEPTH, Places, rolling_displacement
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, Stacked, TINY

@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.frame import LEAST_DEPTH
-from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
-from thermal_fiducial.core.detection.twist import (
+from thermal_fiducial.core.detection.prediction.frame import LEAST_DEPTH
+from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers
+from thermal_fiducial.core.detection.prediction.twist import (
     corrected,
     interaction,
     RANDOM,

@@ -6,20 +6,20 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import among, CUT_OFF_PX, FoundMarkers, TOGETHER
-from thermal_fiducial.core.detection.pattern_fit import aligned
-from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
-from thermal_fiducial.core.detection.quads import (
+from thermal_fiducial.core.detection.corners.pattern_fit import aligned
+from thermal_fiducial.core.detection.finding.quads import (
     dark_in_picture,
     DarkRegions,
     find_quads,
     halfway,
     halved,
     Scale,
-    without_columns,
 )
+from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
+from thermal_fiducial.core.detection.prediction.frame import Frame
+from thermal_fiducial.core.detection.prediction.known_markers import among, CUT_OFF_PX, FoundMarkers, TOGETHER
 from thermal_fiducial.core.geometry.se3 import diagonals, grown, sides_px, squared_sides
+from thermal_fiducial.core.pixel_noise import with_columns_corrected
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.
@@ -99,7 +99,7 @@ class BlindSearch:
         if SearchScales.FINE in scales:
             fine = find_quads(self._fine_mask(frame, clear=clear), min_side_px, hidden, edge_px)
         if SearchScales.FAINT in scales:
-            half = without_columns(halved(frame.image), 0.5 * frame.noise)
+            half = with_columns_corrected(halved(frame.image), 0.5 * frame.noise)
             masks = (self._faint.mask(half if kind > 0.0 else -half, 0.5 * frame.noise, clear=clear) for kind in kinds)
             found = [find_quads(mask, 0.5 * config.min_side_px + 2.0, halfway(hidden)) for mask in masks]
             faint = 2.0 * np.concatenate(found) + 0.5

@@ -4,7 +4,6 @@ The threshold is a share of the local standard deviation, so that markers of any
 the order of the noise it rises again: a marker of twice the noise is still segmented, a bare wall hardly at all.
 """
 
-import math
 from typing import Any, NamedTuple, TypeAlias
 
 import cv2
@@ -17,13 +16,9 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 _LOCAL = 17
 # Odd width of the median filter that removes specks.
 _SPECKS = 3
-# Columns among which one is compared with their mean.
-_COLUMNS = 9
 # In a picture for a display: odd width of the surroundings, no wider than the white around the smallest markers; least
 # difference of a dark pixel from their mean [gray levels] and [standard deviations of the noise].
 _PICTURE_WINDOW_PX, _PICTURE_STEP, _PICTURE_NOISE = 5, 3.0, 2.0
-# Mean of Gaussian noise clipped at one standard deviation moves by the share of it within, 0.68, of a small offset.
-_CLIPPED = 1.0 / math.erf(math.sqrt(0.5))
 # Floor of the local standard deviation where all markers have a high contrast [standard deviations of the noise].
 _FLOOR_OF_CLEAR = 4.0
 # Tolerance of polygon approximation as a share of an outline's length: above the effect of noise, below a side.
@@ -42,21 +37,6 @@ def halved(counts: Float32Array) -> Float32Array:
 def halfway(places: FloatArray) -> FloatArray:
     """Places (..., 2) in pixels of half the resolution."""
     return 0.5 * (places - 0.5)
-
-
-def without_columns(counts: Float32Array, noise: float) -> Float32Array:
-    """``counts`` without the fixed-pattern offsets of its columns from their neighbours.
-
-    The steps from column to column, clipped at their noise so that the scene has little influence, add up to the
-    pattern. Of their sum, only what differs between neighbouring columns is certain.
-    """
-    steps = cv2.subtract(counts[:, 1:], counts[:, :-1])
-    limit = np.float32(math.sqrt(2.0) * noise)
-    np.clip(steps, -limit, limit, out=steps)
-    offsets = np.zeros((1, counts.shape[1]), dtype=np.float32)
-    np.cumsum(_CLIPPED * cv2.reduce(steps, 0, cv2.REDUCE_AVG)[0], out=offsets[0, 1:])
-    offsets -= cv2.blur(offsets, (_COLUMNS, 1))
-    return np.subtract(counts, offsets)
 
 
 class Scale(NamedTuple):

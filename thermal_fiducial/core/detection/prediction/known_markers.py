@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.frame import LEAST_DEPTH, Places
+from thermal_fiducial.core.detection.prediction.frame import LEAST_DEPTH, Places
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners

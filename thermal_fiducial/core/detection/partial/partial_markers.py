@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corner_errors import OF_BENT_SCALE_PX, of_motion_blur, OF_SIDES_PX
-from thermal_fiducial.core.detection.corners.grid import (
+from thermal_fiducial.core.detection.corners.corner_errors import OF_BENT_SCALE_PX, of_motion_blur, OF_SIDES_PX
+from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
+from thermal_fiducial.core.detection.partial.grid import (
     adjusted,
     grid_edges,
     Layer,
@@ -21,11 +22,10 @@ from thermal_fiducial.core.detection.corners.grid import (
     pose_jacobian,
     PoseFit,
 )
-from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import PartialMarkers
+from thermal_fiducial.core.detection.partial.visible_cells import VisibleCells
 from thermal_fiducial.core.detection.patterns import CELL_SAMPLES, Decoder, most_similar, NEAR_CELLS
-from thermal_fiducial.core.detection.refined_corners import RefinedCorners
-from thermal_fiducial.core.detection.visible_cells import VisibleCells
+from thermal_fiducial.core.detection.prediction.frame import Frame
+from thermal_fiducial.core.detection.prediction.known_markers import PartialMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import marker_corners

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.frame import without_tails
+from thermal_fiducial.core.detection.prediction.frame import without_tails
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
 from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.blurred_patterns import (
+from thermal_fiducial.core.detection.corners.blurred_patterns import (
     BOWL,
     BOWL_AT_CORNERS,
     linearised,
@@ -23,12 +23,12 @@ from thermal_fiducial.core.detection.blurred_patterns import (
     PatternResiduals,
     PatternView,
 )
-from thermal_fiducial.core.detection.corner_errors import OF_DISPLAYED_PATTERN_PX, OF_PATTERN_PX, SURFACE_FALLS
+from thermal_fiducial.core.detection.corners.corner_errors import OF_DISPLAYED_PATTERN_PX, OF_PATTERN_PX, SURFACE_FALLS
+from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.corners.squares import as_squares
-from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.refined_corners import RefinedCorners
+from thermal_fiducial.core.detection.prediction.frame import Frame
+from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.se3 import diagonals, sides_px, squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY

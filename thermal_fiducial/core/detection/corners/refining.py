@@ -1,10 +1,10 @@
 """Sub-pixel refinement of corners in frames that are blurred by motion and bolometer lag.
 
 The camera's twist gives the motion blur of each marker. Where it is large, the lag tail is removed around the marker
-(see :mod:`frame`); the edge model contains the blur that remains, and the known displacement by lag is subtracted from
+(see :mod:`prediction.frame`); the edge model contains the blur that remains, and the known displacement by lag is subtracted from
 the corners. The corners then correct the twist; if that changes the blur much, the refinement is repeated.
 
-Corners are those of the fitted sides (:mod:`corners.side_fit`), or of the whole pattern where markers are small
+Corners are those of the fitted sides (:mod:`side_fit`), or of the whole pattern where markers are small
 (:mod:`pattern_fit`).
 """
 
@@ -13,16 +13,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.blurred_patterns import PatternView
-from thermal_fiducial.core.detection.corner_errors import of_motion_blur, unknown_motion
+from thermal_fiducial.core.detection.corners.blurred_patterns import PatternView
+from thermal_fiducial.core.detection.corners.corner_errors import of_motion_blur, unknown_motion
+from thermal_fiducial.core.detection.corners.pattern_fit import fitted_patterns, too_small_for_sides
+from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.corners.side_fit import OF_CLEAR, OF_FAINT, refine_corners
-from thermal_fiducial.core.detection.frame import delays, Frame, motion_blur, MotionBlur, Places, rolling_displacement
-from thermal_fiducial.core.detection.known_markers import FoundMarkers
-from thermal_fiducial.core.detection.pattern_fit import fitted_patterns, too_small_for_sides
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.refined_corners import RefinedCorners
-from thermal_fiducial.core.detection.tracking import MotionTrack
-from thermal_fiducial.core.detection.twist import Twist, UNKNOWN_TWIST
+from thermal_fiducial.core.detection.prediction.frame import (
+    delays,
+    Frame,
+    motion_blur,
+    MotionBlur,
+    Places,
+    rolling_displacement,
+)
+from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
+from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
+from thermal_fiducial.core.detection.prediction.twist import Twist, UNKNOWN_TWIST
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.se3 import sides_px
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked, TINY
