@@ -116,16 +116,16 @@ class DisplayedSides:
 
     def _across_border(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> Segments:
         """Inward displacements of the inner edges of the borders, where the cells behind are white."""
-        seen = ImagePoints.at(refined.observed.corners_px, frame.camera)
+        at = ImagePoints.at(refined.observed.corners_px, frame.camera)
         inset = 1.0 / (self._bits + 2.0)
         a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
-        inner = np.moveaxis(se3.seen_between(seen.x, se3.bilinear(a, b)), 0, -1)
+        inner = np.moveaxis(se3.seen_between(at.x, se3.bilinear(a, b)), 0, -1)
         sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _WIDEST_PX)
         blur = blur_of(sides, blur_px, refined.blur.spread)
-        value, slope, counting = model(sides, self._behind[refined.ids], blur)
-        counting &= self._white[refined.ids].reshape(-1, self._bits)
+        modelled = model(sides, self._behind[refined.ids], blur)
+        counting = modelled.counting & self._white[refined.ids].reshape(-1, self._bits)
         counts = counts_of(sides.pixel, frame.image, refined.blur.to_tails)
-        return measure(counts, (value, slope, counting), REACHED * blur.width)
+        return measure(counts, modelled._replace(counting=counting), REACHED * blur.width)
 
 
 def _outward(corners: FloatArray) -> FloatArray:
@@ -137,7 +137,7 @@ def _outward(corners: FloatArray) -> FloatArray:
     return np.asarray((normal + before) / (1.0 + np.sum(normal * before, axis=-1, keepdims=True)))
 
 
-def published(
+def confirmed(
     frame: Frame,
     found: FoundMarkers,
     markers: RefinedMarkers,
@@ -148,7 +148,7 @@ def published(
     """The markers ``found`` that are confirmed at their refined corners, with the corners to publish."""
     if len(found.ids) == 0:
         return markers
-    keep = _confirmed(frame, found, markers, decoder, config)
+    keep = _are_confirmed(frame, found, markers, decoder, config)
     markers = markers if keep.all() else markers.only(keep)
     if config.refinement == 'subpix':
         return replace(markers, corners=local_corners(frame.image, markers.corners, decoder.cells))
@@ -159,7 +159,7 @@ def published(
     return markers
 
 
-def _confirmed(
+def _are_confirmed(
     frame: Frame, found: FoundMarkers, markers: RefinedMarkers, decoder: Decoder, config: ArucoDetectorConfig
 ) -> BoolArray:
     """Which markers show their pattern at the refined corners, and are squares."""
@@ -208,9 +208,9 @@ def _readable(
     return np.asarray((reading.ids == markers.ids) & (known | distinct))
 
 
-def _sharp_and_even(seen: RefinedCorners) -> BoolArray:
+def _sharp_and_even(refined: RefinedCorners) -> BoolArray:
     """Which markers (N,) show neither blur or noise nor a gradient of warmth that a pattern might differ by."""
-    return np.asarray((seen.noise < BLURRED_OUT * np.abs(seen.contrast)) & (seen.mean_variance < _EVEN_PX**2))
+    return np.asarray((refined.noise < BLURRED_OUT * np.abs(refined.contrast)) & (refined.mean_variance < _EVEN_PX**2))
 
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:

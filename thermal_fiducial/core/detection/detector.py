@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
-from thermal_fiducial.core.detection.confirmation import DisplayedSides, published
+from thermal_fiducial.core.detection.confirmation import confirmed, DisplayedSides
 from thermal_fiducial.core.detection.corners.refining import refine
 from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.detection.finding.finder import FrameHistory, MarkerFinder
@@ -97,7 +97,7 @@ class MarkerDetector:
             expected = known.expected(T_camera_map, camera, config.min_side_px)
         found, history = self._finder.find(frame, history, known, expected, config)
         refined = refine(frame, found, self._behind[found.ids], history.track, self._decoder, config)
-        refined = published(frame, found, refined, self._decoder, self._displayed, config)
+        refined = confirmed(frame, found, refined, self._decoder, self._displayed, config)
         ids, corners = refined.ids, refined.corners
         at = refined.places.at.at_pixels(corners.corners_px)
         poses = self._poses(ids, corners.covariances, at, T_camera_map)
@@ -124,8 +124,8 @@ class MarkerDetector:
 
     def _with_partial(self, rows: Markers, frame: Frame, T_camera_map: FloatArray, position_std_m: float) -> Markers:
         """The rows of whole markers, and those of known ones that are partially visible."""
-        seen = rows['id'].astype(np.int64)
-        candidates = self._known.partially_visible(T_camera_map, frame.camera, seen)
+        found_ids = rows['id'].astype(np.int64)
+        candidates = self._known.partially_visible(T_camera_map, frame.camera, found_ids)
         ids, corners = self._partial.look(frame, candidates, position_std_m, self.config)
         if len(ids) == 0:
             return rows

@@ -186,7 +186,7 @@ class Decoder:
         spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), np.float32(TINY))
         return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread, dtype=np.float64)
 
-    def seen(self, ids: IntArray, turns: IntArray) -> FloatArray:
+    def patterns(self, ids: IntArray, turns: IntArray) -> FloatArray:
         """Cells (Q, m, m), 1 for white, as quadrilaterals show markers whose corners they name ``turns`` late."""
         return np.asarray(self._grids[ids, turns])
 
@@ -203,8 +203,8 @@ class Decoder:
         contrast = np.sum(values * shape, axis=1) / np.maximum(np.sum(shape * shape, axis=1), TINY)
         safe = np.where(np.abs(contrast) < TINY, TINY, contrast)[:, None]
         # Cells on the scale from 0 for black to 1 for white.
-        seen = expected + (values - contrast[:, None] * shape) / safe
-        wrong = (seen > 0.5) != (expected > 0.5)
+        read = expected + (values - contrast[:, None] * shape) / safe
+        wrong = (read > 0.5) != (expected > 0.5)
         return Reading(
             best // 4,
             best % 4,

@@ -24,8 +24,14 @@ from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
 _RING = 0.5
 # Place of the end of the warm surface outside the sides [cells].
 _SURFACE_ENDS = 1.0
-#: Place of the bowl of the warm surface among the linear terms, and its value at the corners of the marker.
-BOWL, BOWL_AT_CORNERS = 4, 0.5
+#: Parameters of a fit: u of the corners and v of them, blur, and amounts of the linear terms; the first of these is the
+#: contrast.
+CORNERS, BLUR, LINEAR = slice(0, 8), 8, slice(9, None)
+#: Place of the bowl of the warm surface among the linear terms, and among the parameters; its value at the corners.
+BOWL = 4
+BOWL_AMOUNT, BOWL_AT_CORNERS = LINEAR.start + BOWL, 0.5
+# Places among the linear terms of the gradients of the contrast, and of what gain control adds.
+_GRADIENTS, _OF_GAIN_CONTROL = slice(1, 3), slice(5, None)
 # Cumulative standard normal distribution, by a table.
 _FARTHEST = 6.0
 _Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
@@ -118,7 +124,7 @@ class PatternResiduals(NamedTuple):
     x: Float32Array
     y: Float32Array
     #: (Q, P) gray levels, and these without the pattern; no background in either
-    seen: Float32Array
+    samples: Float32Array
     rest: Float32Array
     #: (Q, L) amounts of the linear terms, the first of them the contrast
     amounts: FloatArray
@@ -126,11 +132,11 @@ class PatternResiduals(NamedTuple):
     J: Float32Array
     grid: PatternGrid
 
-    def seen_at(self, view: PatternView, quads: FloatArray) -> 'PatternResiduals':
+    def sampled_at(self, view: PatternView, quads: FloatArray) -> 'PatternResiduals':
         """The same at corners ``quads`` (Q, 4, 2) so near that the patterns on the markers stay."""
-        seen = self.grid.without_background(view.gray(quads, self.grid))
-        amounts, rest = _fitted(-self.J[:, 9:], seen)
-        return self._replace(corners_px=quads, seen=seen, rest=rest, amounts=amounts)
+        samples = self.grid.without_background(view.gray(quads, self.grid))
+        amounts, rest = _fitted(-self.J[:, LINEAR], samples)
+        return self._replace(corners_px=quads, samples=samples, rest=rest, amounts=amounts)
 
     def information(self) -> FloatArray:
         """Information (Q, 9 + L, 9 + L) of samples with a variance of 1, whatever the background."""
@@ -146,7 +152,7 @@ class PatternResiduals(NamedTuple):
     def pixels(self) -> FloatArray:
         """Pixels (Q,) that the samples cover."""
         (xu, xv), (yu, yv) = np.moveaxis(self.to_cells, 0, -1)
-        return np.asarray(self.seen.shape[1] / self.grid.density**2 / np.abs(xu * yv - xv * yu))
+        return np.asarray(self.samples.shape[1] / self.grid.density**2 / np.abs(xu * yv - xv * yu))
 
 
 def linearised(
@@ -165,24 +171,24 @@ def linearised(
         spread = spread + moved @ moved.swapaxes(1, 2)
     x, y = _weights(grid.along, cells, np.sqrt(np.einsum('qii->iq', spread)))
     model = _model(x, y, white, *(part.astype(np.float32) for part in (spread, blur, of_optics)))
-    seen = grid.without_background(view.gray(quads, grid))
+    samples = grid.without_background(view.gray(quads, grid))
     terms = grid.without_background(_linear_terms(model, spread, grid, cells, displayed=view.displayed))
-    amounts, rest = _fitted(terms, seen)
+    amounts, rest = _fitted(terms, samples)
     contrast = _contrast(amounts.astype(np.float32), model, grid, displayed=view.displayed)
     # Steps of an alignment are long: what of the slopes looks like background is not trusted.
     slopes = model.slopes if grid.graded else grid.without_background(model.slopes)
     by_px = to_cells.swapaxes(1, 2).astype(np.float32) @ (slopes * contrast).swapaxes(0, 1)
-    J = np.empty((count, 9 + terms.shape[1], seen.shape[1]), dtype=np.float32)
-    np.multiply(by_px[:, :, None], grid.weights, out=J[:, :8].reshape(count, 2, 4, -1))
-    J[:, 8], J[:, 9:] = -contrast * model.wider, -terms
-    return PatternResiduals(quads, blur, to_cells, x[:, 0], y[:, 0], seen, rest, amounts, J, grid)
+    J = np.empty((count, LINEAR.start + terms.shape[1], samples.shape[1]), dtype=np.float32)
+    np.multiply(by_px[:, :, None], grid.weights, out=J[:, CORNERS].reshape(count, 2, 4, -1))
+    J[:, BLUR], J[:, LINEAR] = -contrast * model.wider, -terms
+    return PatternResiduals(quads, blur, to_cells, x[:, 0], y[:, 0], samples, rest, amounts, J, grid)
 
 
-def _fitted(terms: Float32Array, seen: Float32Array) -> tuple[FloatArray, Float32Array]:
+def _fitted(terms: Float32Array, samples: Float32Array) -> tuple[FloatArray, Float32Array]:
     """Amounts (Q, L) of linear terms (Q, L, P) in gray levels (Q, P), and what they leave of these."""
     products = np.asarray(terms @ terms.swapaxes(1, 2), dtype=np.float64) + TINY * np.eye(terms.shape[1])
-    amounts = np.linalg.solve(products, terms @ seen[..., None])
-    rest = seen - (terms.swapaxes(1, 2) @ amounts.astype(np.float32))[..., 0]
+    amounts = np.linalg.solve(products, terms @ samples[..., None])
+    rest = samples - (terms.swapaxes(1, 2) @ amounts.astype(np.float32))[..., 0]
     return np.asarray(amounts[..., 0]), np.asarray(rest)
 
 
@@ -190,9 +196,9 @@ def _contrast(amounts: Float32Array, model: PatternModel, grid: PatternGrid, *, 
     """White minus black (Q, P or 1) where the samples are, by the amounts (Q, L) of the linear terms."""
     if not grid.graded:
         return amounts
-    contrast = amounts[:, :1] + amounts[:, 1:3] @ grid.middle + amounts[:, BOWL, None] * grid.bowl
+    contrast = amounts[:, :1] + amounts[:, _GRADIENTS] @ grid.middle + amounts[:, BOWL, None] * grid.bowl
     if displayed:
-        contrast += amounts[:, 5:] * (1.0 + 2.0 * model.value)
+        contrast += amounts[:, _OF_GAIN_CONTROL] * (1.0 + 2.0 * model.value)
     return np.asarray(contrast)
 
 

@@ -47,8 +47,8 @@ OF_GRADIENT_PX2, GRADIENT_AS_CONTRAST_PX = 2.0, 2.0
 #: the motion blur. Rendered frames of a lag in steps, and of one of 14 ms taken for 10: corners with 2 to 8 px of blur
 #: are displaced by 0.010 to 0.014 of it, along the motion and across.
 OF_LAG, OF_LAG_FORM = 0.35, 0.014
-#: Displacement [px] by motion blur over the residuals that it leaves of a model without it, in contrasts, and the
-#: residuals that hardly grow with it any more: 0.015 without it, 0.05 where it is 1.5 px, 0.08 where it is 6 px.
+#: Displacement of a corner by motion blur that is not modelled [px], over the residuals that it leaves [contrasts], and
+#: the residuals beyond which they hardly grow with it. Measured: 0.015 at rest, 0.05 at 1.5 px of blur, 0.08 at 6 px.
 BLUR_THAT_SHOWS, BLURRED_OUT = 20.0, 0.055
 #: The same of any marker that can be read, in cells: nine of ten are off by less than 0.65, seen without a motion.
 READABLE_CELLS = 0.4

@@ -16,8 +16,11 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.corners.blurred_patterns import (
+    BLUR,
     BOWL,
+    BOWL_AMOUNT,
     BOWL_AT_CORNERS,
+    CORNERS,
     linearised,
     pattern_grid,
     PatternResiduals,
@@ -82,21 +85,24 @@ class _Prior(NamedTuple):
     corners_std: FloatArray
     blur_px: float
 
-    def normal_equations(self, at: PatternResiduals, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """With it, (Q, K, K), (Q, K, 1), for samples with a variance of 1, whose information is ``seen`` (Q, K, K)."""
+    def normal_equations(self, at: PatternResiduals, by_samples: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """With it, (Q, K, K), (Q, K, 1), for samples with a variance of 1.
+
+        ``by_samples`` (Q, K, K): information by the samples alone.
+        """
         precision, off = self._precision(at), np.zeros(at.J.shape[:2])
-        off[:, :8] = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
-        off[:, 8], off[:, 9 + BOWL] = at.blur - self.blur_px, at.amounts[:, BOWL]
-        information = seen.copy()
+        off[:, CORNERS] = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
+        off[:, BLUR], off[:, BOWL_AMOUNT] = at.blur - self.blur_px, at.amounts[:, BOWL]
+        information = by_samples.copy()
         np.einsum('qii->qi', information)[:] += precision
         return _solvable(information), _gradient(at) + (precision * off)[..., None]
 
     def _precision(self, at: PatternResiduals) -> FloatArray:
         """Inverse variances (Q, K), for samples with a variance of 1."""
         precision = np.zeros(at.J.shape[:2])
-        precision[:, :8] = 1.0 / self.corners_std[:, None] ** 2
-        precision[:, 8] = 1.0 / (_FOCUS * self.blur_px) ** 2
-        precision[:, 9 + BOWL] = 1.0 / ((SURFACE_FALLS / BOWL_AT_CORNERS * at.contrast) ** 2 + TINY)
+        precision[:, CORNERS] = 1.0 / self.corners_std[:, None] ** 2
+        precision[:, BLUR] = 1.0 / (_FOCUS * self.blur_px) ** 2
+        precision[:, BOWL_AMOUNT] = 1.0 / ((SURFACE_FALLS / BOWL_AT_CORNERS * at.contrast) ** 2 + TINY)
         return precision * _variance_of_samples(at, self.blur_px)[:, None]
 
 
@@ -159,14 +165,14 @@ def fitted_patterns(
 
 def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: Decoder, blur_px: float) -> PatternFit:
     """Fits of the markers ``ids`` (Q,), upright in ``quads`` (Q, 4, 2), which are accurate to half a cell."""
-    white, blur = decoder.seen(ids, np.zeros_like(ids)), np.full(len(ids), blur_px)
+    white, blur = decoder.patterns(ids, np.zeros_like(ids)), np.full(len(ids), blur_px)
     cell = sides_px(quads) / decoder.cells
     grid = pattern_grid(decoder.cells, max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX)))
     prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
     at = linearised(view, quads, blur, white, grid)
-    seen = at.information()
+    by_samples = at.information()
     for left in reversed(range(_STEPS)):
-        information, product = prior.normal_equations(at, seen)
+        information, product = prior.normal_equations(at, by_samples)
         move = _step(information, product)
         quads, blur = _moved(at, move, blur_px)
         step = np.abs(quads - at.corners_px).max(axis=(1, 2))
@@ -175,14 +181,14 @@ def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: D
             break
         if longest > _SAME_PX or other:
             at = linearised(view, quads, blur, white, grid)
-            seen = at.information()
+            by_samples = at.information()
         else:
-            at = at.seen_at(view, quads)
+            at = at.sampled_at(view, quads)
     # The last step is so short that it changes residuals linearly.
     hidden = grid.without_background((at.J.swapaxes(1, 2) @ move[..., None].astype(np.float32))[..., 0])
     at = at._replace(rest=at.rest + hidden)
     share = _variance_of_samples(at, blur_px)
-    covariance = np.linalg.inv(information)[:, :8, :8] * share[:, None, None]
+    covariance = np.linalg.inv(information)[:, CORNERS, CORNERS] * share[:, None, None]
     # From u of all corners and v of all of them to u and v of each.
     covariance = covariance.reshape(-1, 2, 4, 2, 4).transpose(0, 2, 1, 4, 3).reshape(-1, 8, 8)
     return PatternFit(quads, covariance, at.contrast, np.sqrt(_noise_variance(at, blur_px)), step, at)
@@ -198,7 +204,7 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
     image : (height, width) counts
     ids, turns : (Q,) markers, and the quarter turns in which the outlines show them
     """
-    white, grid = decoder.seen(ids, turns), pattern_grid(decoder.cells, _FEWEST, bent=True)
+    white, grid = decoder.patterns(ids, turns), pattern_grid(decoder.cells, _FEWEST, bent=True)
     cell = np.maximum(diagonals(quads) / (math.sqrt(2.0) * decoder.cells), _LEAST_CELL_PX)
     smoothing = min(_SMOOTHING_PX, _SMOOTHING * float(np.median(cell)))
     view = PatternView(np.asarray(cv2.GaussianBlur(image, (0, 0), smoothing), dtype=np.float32))
@@ -223,7 +229,7 @@ def _noise_variance(at: PatternResiduals, blur_px: float) -> FloatArray:
 
 def _variance_of_samples(at: PatternResiduals, blur_px: float) -> FloatArray:
     """Variance (Q,) that samples would have, were they independent and said as much as the pixels."""
-    return np.asarray(_noise_variance(at, blur_px) * at.seen.shape[1] / at.pixels)
+    return np.asarray(_noise_variance(at, blur_px) * at.samples.shape[1] / at.pixels)
 
 
 def _independent(at: PatternResiduals, blur_px: float) -> FloatArray:
@@ -251,8 +257,8 @@ def _step(information: FloatArray, gradient: FloatArray) -> FloatArray:
 def _moved(at: PatternResiduals, step: FloatArray, blur_px: float | FloatArray) -> tuple[FloatArray, FloatArray]:
     """Corners (Q, 4, 2) and blur (Q,) after a step (Q, K), which is limited."""
     longest = _LONGEST / np.sqrt(np.abs(np.linalg.det(at.to_cells)))[:, None]
-    corners = at.corners_px + np.clip(step[:, :8], -longest, longest).reshape(-1, 2, 4).swapaxes(1, 2)
-    wider = np.clip(step[:, 8], -_LONGEST_BLUR * blur_px, _LONGEST_BLUR * blur_px)
+    corners = at.corners_px + np.clip(step[:, CORNERS], -longest, longest).reshape(-1, 2, 4).swapaxes(1, 2)
+    wider = np.clip(step[:, BLUR], -_LONGEST_BLUR * blur_px, _LONGEST_BLUR * blur_px)
     return corners, np.clip(at.blur + wider, _BLURS[0] * blur_px, _BLURS[1] * blur_px)
 
 
@@ -291,10 +297,10 @@ def _content(at: PatternResiduals, cells: int) -> FloatArray:
     inner = np.pad(np.ones((cells - 2, cells - 2)), 1)
     squares = np.stack([np.ones((cells, cells)), inner])
     drawn = at.y[:, None] @ squares @ at.x.swapaxes(1, 2)[:, None]
-    shown = at.grid.without_background(drawn.reshape(len(at.seen), 2, -1).astype(np.float32))
-    product = shown @ at.seen[..., None]
+    shown = at.grid.without_background(drawn.reshape(len(at.samples), 2, -1).astype(np.float32))
+    product = shown @ at.samples[..., None]
     explained = product.swapaxes(1, 2) @ np.linalg.solve(shown @ shown.swapaxes(1, 2) + TINY * np.eye(2), product)
-    return np.asarray(1.0 - explained[:, 0, 0] / np.maximum((at.seen * at.seen).sum(axis=1), TINY))
+    return np.asarray(1.0 - explained[:, 0, 0] / np.maximum((at.samples * at.samples).sum(axis=1), TINY))
 
 
 def _explained(at: PatternResiduals, which: IntArray, decoder: Decoder) -> FloatArray:
@@ -303,9 +309,9 @@ def _explained(at: PatternResiduals, which: IntArray, decoder: Decoder) -> Float
     flat = black.reshape(len(black), -1)
     background = at.grid.background.T.reshape(3, len(at.grid.along), -1)
     shares = np.empty((len(which), len(black)))
-    for row, (seen, x, y) in enumerate(zip(at.seen[which], at.x[which], at.y[which], strict=True)):
-        product = flat @ (y.T @ seen.reshape(background.shape[1:]) @ x).ravel()
+    for row, (samples, x, y) in enumerate(zip(at.samples[which], at.x[which], at.y[which], strict=True)):
+        product = flat @ (y.T @ samples.reshape(background.shape[1:]) @ x).ravel()
         size = ((y.T @ y) @ black @ (x.T @ x)).reshape(len(black), -1)
         size = (size * flat).sum(axis=1) - ((flat @ (y.T @ background @ x).reshape(3, -1).T) ** 2).sum(axis=1)
-        shares[row] = product * product / np.maximum(size * (seen @ seen), TINY)
+        shares[row] = product * product / np.maximum(size * (samples @ samples), TINY)
     return shares

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.core.detection.corners.segments import Segments
-from thermal_fiducial.core.detection.corners.sides import reaches, Sides
+from thermal_fiducial.core.detection.corners.sides import EdgeModel, reaches, Sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Stacked
 
 # Distance from the sides [blurs] beyond which pixels do not count where a gradient of temperature displaces a side: it
@@ -73,7 +73,7 @@ class Reach(Stacked):
 
 def ending_sides(
     counts: Float32Array,
-    modelled: tuple[Float32Array, Float32Array, BoolArray],
+    modelled: EdgeModel,
     sides: Sides,
     segments: Segments,
     outward: FloatArray,

@@ -39,7 +39,19 @@ class RefinedCorners(Stacked):
         return np.asarray(self.covariances.diagonal(axis1=-2, axis2=-1).mean(axis=(1, 2)))
 
     @staticmethod
+    def by_edges(
+        corners_px: FloatArray,
+        covariances: FloatArray,
+        contrast: FloatArray,
+        noise: FloatArray,
+        doubt: FloatArray,
+    ) -> 'RefinedCorners':
+        """Corners whose edges were fitted, not their pattern."""
+        no = np.zeros(len(corners_px), dtype=bool)
+        return RefinedCorners(corners_px, covariances, contrast, noise, doubt, no, no, no)
+
+    @staticmethod
     def none() -> 'RefinedCorners':
         """No corners."""
-        no, none = np.zeros(0), np.zeros(0, dtype=bool)
-        return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no, none, none, none)
+        no = np.zeros(0)
+        return RefinedCorners.by_edges(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no)

@@ -1,8 +1,9 @@
 """Sub-pixel refinement of corners in frames that are blurred by motion and bolometer lag.
 
 The camera's twist gives the motion blur of each marker. Where it is large, the lag tail is removed around the marker
-(see :mod:`prediction.frame`); the edge model contains the blur that remains, and the known displacement by lag is subtracted from
-the corners. The corners then correct the twist; if that changes the blur much, the refinement is repeated.
+(see :mod:`prediction.frame`); the edge model contains the blur that remains, and the known displacement by lag is
+subtracted from the corners. The corners then correct the twist; if that changes the blur much, the refinement is
+repeated.
 
 Corners are those of the fitted sides (:mod:`side_fit`), or of the whole pattern where markers are small
 (:mod:`pattern_fit`).
@@ -91,11 +92,11 @@ def refine(
         start = places.at.at_pixels(places.at.px + blur.shift)
         small = too_small_for_sides(start.px, decoder.cells, config.blur_px)
         if small.any():
-            seen = _with_small(frame, found, start, blur, behind, columns, small, decoder, config)
+            refined = _with_small(frame, found, start, blur, behind, columns, small, decoder, config)
         else:
-            seen = refine_corners(frame.image, start, frame.camera, behind, config.blur_px, columns, blur)
-        markers = _at_stamp(frame, found.ids, places, blur, seen, twist, track, behind.shape[2])
-        change = np.abs(markers.corners.corners_px - seen.corners_px + blur.shift)
+            refined = refine_corners(frame.image, start, frame.camera, behind, config.blur_px, columns, blur)
+        markers = _at_stamp(frame, found.ids, places, blur, refined, twist, track, behind.shape[2])
+        change = np.abs(markers.corners.corners_px - refined.corners_px + blur.shift)
         if markers.twist is None or change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX:
             break
         twist, places = markers.twist, markers.places
@@ -131,16 +132,16 @@ def _at_stamp(
     ids: IntArray,
     places: Places,
     blur: MotionBlur,
-    seen: RefinedCorners,
+    refined: RefinedCorners,
     known: Twist | None,
     track: MotionTrack,
     cells: int,
 ) -> RefinedMarkers:
     """Corners at the stamp, without lag and rolling shutter, by the twist that they correct."""
-    at = places.at.at_pixels(seen.corners_px - blur.shift)
-    deviation = np.sqrt(seen.mean_variance) / frame.camera.focal_px
+    at = places.at.at_pixels(refined.corners_px - blur.shift)
+    deviation = np.sqrt(refined.mean_variance) / frame.camera.focal_px
     # Corners that are inconsistent with a square get a larger covariance.
-    doubted = seen.covariances + seen.doubt[:, None, None, None] * _EYE
+    doubted = refined.covariances + refined.doubt[:, None, None, None] * _EYE
     # Without a predicted twist, the first round measures one between two lagging frames, and the second must not again:
     # its corners are corrected for lag, those of the last frame are not.
     twist = known
@@ -148,26 +149,28 @@ def _at_stamp(
         sure = np.ones(len(ids), dtype=bool)
         if frame.displayed:
             # What looks like a small marker may be another thing.
-            sure = seen.evident | ~seen.by_pattern
+            sure = refined.evident | ~refined.by_pattern
         twist = track.correct(frame.stamp_ns, frame.twist, ids[sure], at.x[sure], places.depth[sure], deviation[sure])
     if twist is None:
-        unsure = doubted + _of_unpredicted_motion(frame, places, seen, UNKNOWN_TWIST, cells)
+        unsure = doubted + _of_unpredicted_motion(frame, places, refined, UNKNOWN_TWIST, cells)
         return RefinedMarkers(
-            ids, seen, blur, replace(seen, covariances=unsure), Places(at, places.depth, places.flow), None
+            ids, refined, blur, replace(refined, covariances=unsure), Places(at, places.depth, places.flow), None
         )
     lag_blur = places.lag_blur(twist, frame.lag)
-    rolling = rolling_displacement(places, twist, frame, (seen.corners_px + blur.removed)[..., 1])
-    px = seen.corners_px - lag_blur + blur.removed - rolling
+    rolling = rolling_displacement(places, twist, frame, (refined.corners_px + blur.removed)[..., 1])
+    px = refined.corners_px - lag_blur + blur.removed - rolling
     unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur)
     if frame.twist is None:
-        unknown = unknown + _of_unpredicted_motion(frame, places, seen, twist, cells)
-    corners = replace(seen, corners_px=px, covariances=doubted + unknown)
-    return RefinedMarkers(ids, seen, blur, corners, Places(at.at_pixels(px), places.depth, places.flow), twist)
+        unknown = unknown + _of_unpredicted_motion(frame, places, refined, twist, cells)
+    corners = replace(refined, corners_px=px, covariances=doubted + unknown)
+    return RefinedMarkers(ids, refined, blur, corners, Places(at.at_pixels(px), places.depth, places.flow), twist)
 
 
-def _of_unpredicted_motion(frame: Frame, places: Places, seen: RefinedCorners, twist: Twist, cells: int) -> FloatArray:
+def _of_unpredicted_motion(
+    frame: Frame, places: Places, refined: RefinedCorners, twist: Twist, cells: int
+) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] by the motion in a frame without a predicted twist."""
-    since = frame.lag - delays(seen.corners_px[..., 1], frame)
-    unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), TINY)
-    cell = sides_px(seen.corners_px) / cells
+    since = frame.lag - delays(refined.corners_px[..., 1], frame)
+    unsharpness = refined.noise / np.maximum(np.abs(refined.contrast), TINY)
+    cell = sides_px(refined.corners_px) / cells
     return unknown_motion(since[..., None, None] * places.flow, twist.covariance, unsharpness, cell)

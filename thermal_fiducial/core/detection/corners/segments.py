@@ -16,7 +16,7 @@ from thermal_fiducial.core.detection.corners.corner_errors import (
     OF_SIDES_PX,
     OF_UNEVEN_CONTRAST_PX,
 )
-from thermal_fiducial.core.detection.corners.sides import ENDS, Sides, STARTS
+from thermal_fiducial.core.detection.corners.sides import EdgeModel, ENDS, Sides, STARTS
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, SIGMA_OF_MEDIAN, TINY
 
 #: Largest displacement for which the linearisation holds, in standard deviations of the blur.
@@ -119,7 +119,7 @@ class _SegmentFit(NamedTuple):
 
 def measure(
     counts: Float32Array,
-    modelled: tuple[Float32Array, Float32Array, BoolArray],
+    modelled: EdgeModel,
     reach: FloatArray,
     of_each: int = 4,
 ) -> Segments:
@@ -128,16 +128,14 @@ def measure(
     Parameters
     ----------
     counts : (M, C, E, m) of the pixels across the sides
-    modelled : value and derivative of each pixel (M, C, E, m), and whether it counts, of ``sides.model``
     reach : (E, m) longest displacement for which the model can be linearised [px]
     of_each : number of sides of a marker
     """
-    value, slope, counting = modelled
     segments = of_each * counts.shape[3]
     X = np.empty((_PLANES, *counts.shape), dtype=np.float32)
-    X[0] = counting
-    np.multiply(value, X[0], out=X[1])
-    np.multiply(slope, X[0], out=X[2])
+    X[0] = modelled.counting
+    np.multiply(modelled.value, X[0], out=X[1])
+    np.multiply(modelled.slope, X[0], out=X[2])
     np.subtract(counts, counts[counts.shape[0] // 2, counts.shape[1] // 2], out=X[3])
     X[3] *= X[0]
     X = X.reshape(_PLANES, counts.shape[0] * counts.shape[1], -1)
@@ -220,11 +218,11 @@ def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> tuple[Se
     opposite, shape = (..., slice(None, None, -1)), (len(segments.shift), 2, 2, sides.across.shape[1])
     good = (segments.variance < UNMEASURED).reshape(shape)
     used = good.sum(axis=3)
-    number, seen = np.maximum(used, 1), used > 0
+    number, measured = np.maximum(used, 1), used > 0
     contrast = (segments.contrast.reshape(shape) * good).sum(axis=3) / number
     relative = (segments.variance.reshape(shape) * good).sum(axis=3) / (number * blur_px) ** 2
     noise = contrast * contrast * relative
-    both, difference = seen & seen[opposite], contrast - contrast[opposite]
+    both, difference = measured & measured[opposite], contrast - contrast[opposite]
     change = np.where(both, difference * difference - noise - noise[opposite], 0.0)
     gradient = np.sqrt(np.maximum(change, 0.0)) * (shape[3] / sides.across.reshape(shape).sum(axis=3))
     left = np.abs(contrast) - GRADIENT_AS_CONTRAST_PX * gradient

@@ -20,7 +20,16 @@ from thermal_fiducial.core.detection.corners.segments import (
     UNMEASURED,
     with_gradients,
 )
-from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, model, ONE_GAUSSIAN, reaches, Sides, sides_of
+from thermal_fiducial.core.detection.corners.sides import (
+    Blur,
+    blur_of,
+    EdgeModel,
+    model,
+    ONE_GAUSSIAN,
+    reaches,
+    Sides,
+    sides_of,
+)
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.corners.uneven_contrast import freed_of_unevenness
 from thermal_fiducial.core.detection.prediction.frame import counts_of, MotionBlur, WITHOUT_TAIL
@@ -118,7 +127,7 @@ def _again(
 
 def _measured(
     counts: Float32Array,
-    modelled: tuple[Float32Array, Float32Array, BoolArray],
+    modelled: EdgeModel,
     sides: Sides,
     blur: Blur,
     outward: FloatArray,
@@ -155,5 +164,4 @@ def _moved(
     corners = sides.ends.reshape(-1, 8, 2).take(_CORNERS, axis=1) + shift
     # More passes would not make corners better that are displaced by their own contrast.
     covariances = covariances + (displaced_px * displaced_px)[:, None, None, None] * _EYE
-    no = np.zeros(len(doubt), dtype=bool)
-    return RefinedCorners(corners, covariances, contrast, noise, doubt, no, no, no), moving
+    return RefinedCorners.by_edges(corners, covariances, contrast, noise, doubt), moving

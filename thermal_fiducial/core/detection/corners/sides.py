@@ -55,6 +55,17 @@ class Blur(NamedTuple):
     width: FloatArray
 
 
+class EdgeModel(NamedTuple):
+    """Blurred steps as the pixels across edges show them, (M, C, E, m) each."""
+
+    #: share of white, up to a constant
+    value: Float32Array
+    #: its derivative by the distance from the edge [1/px]
+    slope: Float32Array
+    #: which pixels count
+    counting: BoolArray
+
+
 @dataclass(frozen=True, slots=True)
 class Sides:
     """The E = 4 N sides of N markers in m parts each, and C columns of M pixels across every part."""
@@ -235,18 +246,14 @@ def blur_of(sides: Sides, optics: float, motion: FloatArray, parts: FloatArray =
 
 def model(
     sides: Sides, behind: Float32Array, blur: Blur, limits: tuple[FloatArray, FloatArray] | None = None
-) -> tuple[Float32Array, Float32Array, BoolArray]:
-    """Share of white in every pixel, up to a constant, its derivative by distance, and whether the pixel counts.
+) -> EdgeModel:
+    """Model of the sides of markers, with the parallel edges behind them where these are near.
 
     Parameters
     ----------
     behind : (N, 4, m, 2) of :func:`edges_behind`
     blur : of the sides
     limits : (E, m) each, inside and outside; those of :func:`reaches` when left out
-
-    Returns
-    -------
-    (M, C, E, m) each
     """
     cells = behind.shape[2]
     overlapping = sides.across < cells * _NARROW * blur.width
@@ -259,7 +266,7 @@ def model(
     counting &= sides.fresh & (own > _MOSTLY)
     if sides.inside is not None:
         counting &= sides.inside
-    return value, slope, counting
+    return EdgeModel(value, slope, counting)
 
 
 def reaches(sides: Sides, width: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -56,25 +56,25 @@ class Squared(NamedTuple):
         return np.asarray(together * blocks)
 
 
-def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squared:
+def as_squares(at: ImagePoints, measured: FloatArray, covariance: FloatArray) -> Squared:
     """Displacements of corners with the constraint of a square.
 
     Two planar poses of a small square look almost alike. The one nearer to the initial corners, translated, is taken
-    unless the image rules it out; then the nearest one of those begun at the seen corners and at their two poses.
+    unless the image rules it out; then the nearest one of those begun at the measured corners and at their two poses.
 
     Parameters
     ----------
     at : (N, 4) initial corners
-    seen, covariance : (N, 8, 1), (N, 8, 8) measured displacements of the corners [px]
+    measured, covariance : (N, 8, 1), (N, 8, 8) displacements of the corners [px]
     """
-    nearest = _corrected(at, _TOGETHER @ seen, seen, covariance)
-    # Linearised away from a square, the constraints miss that they fold where small squares are seen from in front.
-    # Both poses of the seen corners are squares to begin at.
+    nearest = _corrected(at, _TOGETHER @ measured, measured, covariance)
+    # Linearised away from a square, the constraints miss that they fold where small squares are viewed from in front.
+    # Both poses of the measured corners are squares to begin at.
     for pose in (None, 0, 1):
         refuted = np.flatnonzero(nearest.chi2 > _INCONSISTENT)
         if len(refuted) == 0:
             break
-        points, off = at.only(refuted), seen[refuted]
+        points, off = at.only(refuted), measured[refuted]
         other = _corrected(points, off if pose is None else _square_of(points, off, pose), off, covariance[refuted])
         better = other.chi2 < nearest.chi2[refuted]
         for mine, its in zip(nearest, other, strict=True):
@@ -82,23 +82,23 @@ def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squ
     return nearest
 
 
-def _square_of(at: ImagePoints, seen: FloatArray, pose: int) -> FloatArray:
-    """Displacements (N, 8, 1) to the squares in one of the two planar poses of the seen corners [px]."""
-    T = ippe_square(at.x + (at.inverse @ seen.reshape(-1, 4, 2, 1))[..., 0], np.ones(len(seen)))[:, pose]
+def _square_of(at: ImagePoints, measured: FloatArray, pose: int) -> FloatArray:
+    """Displacements (N, 8, 1) to the squares in one of the two planar poses of the measured corners [px]."""
+    T = ippe_square(at.x + (at.inverse @ measured.reshape(-1, 4, 2, 1))[..., 0], np.ones(len(measured)))[:, pose]
     corners = apply(T, marker_corners(1.0))
     return np.asarray(at.J @ (corners[..., :2] / corners[..., 2:] - at.x)[..., None]).reshape(-1, 8, 1)
 
 
-def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance: FloatArray) -> Squared:
+def _corrected(at: ImagePoints, moved: FloatArray, measured: FloatArray, covariance: FloatArray) -> Squared:
     """Update of an iterated Kalman filter, linearised first at the displacements ``moved`` (N, 8, 1)."""
     for _ in range(_STEPS):
         value, J = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
-        error = value + J @ (seen - moved)
+        error = value + J @ (measured - moved)
         spread = covariance @ J.swapaxes(1, 2)
         variance = _SQUARE_STD**2 + (_BENT * value) ** 2
         information = inverse_2x2(J @ spread + variance * _EYE)
         weighted = information @ error
-        before, moved = moved, seen - spread @ weighted
+        before, moved = moved, measured - spread @ weighted
         if np.abs(moved - before).max() < _BENDS_PX:
             break
     chi2 = np.einsum('nij,nij->n', error, weighted)

@@ -23,8 +23,9 @@ _DISPLACES = 0.83
 # of the blur.
 _SHOWN_AT, _SHOWN_AT_BLUR = 0.5, 0.6
 # Standard deviations of the contrast's coefficients before the segments are seen, in contrasts and sides: level,
-# slopes, curvatures, and a change along the sides that is the same going around the marker: columns of pixels that
-# cross sides obliquely show places displaced along them. At the corners both curvatures together are half of one.
+# slopes, curvatures, and a change along each side that has the same sign all around the marker: where columns of pixels
+# cross a side obliquely, they show the contrast of places displaced along it. At the corners both curvatures together
+# are half of one.
 _BEFORE = np.array([1.0, 1.0, 1.0, 2.0 * SURFACE_FALLS, 2.0 * SURFACE_FALLS, 2.0 * SURFACE_FALLS])
 _PRIOR = np.diag(_BEFORE**-2.0).ravel()
 # Least number of segments that show it, and range of their contrasts over that of the typical one: others are not of

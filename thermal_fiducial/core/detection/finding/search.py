@@ -77,7 +77,7 @@ class BlindSearch:
         frame: Frame,
         allowed: BoolArray,
         config: ArucoDetectorConfig,
-        seen: FoundMarkers,
+        found: FoundMarkers,
         scales: SearchScales = SearchScales.ALL,
         kinds: tuple[float, ...] = (1.0, -1.0),
     ) -> Outlines:
@@ -85,12 +85,12 @@ class BlindSearch:
 
         Parameters
         ----------
-        seen : markers found already: they and their plates are left out of the search
+        found : markers found already: they and their plates are left out of the search
         scales : resolutions of the search
         kinds : polarities searched at half resolution, 1 for markers darker than their surroundings, -1 for brighter
         """
         # The plate, and as much again for its blurred edge.
-        hidden = grown(seen.places.at.px, (self._decoder.cells + 4) / self._decoder.cells)
+        hidden = grown(found.places.at.px, (self._decoder.cells + 4) / self._decoder.cells)
         min_side_px, edge_px = config.min_side_px - _SHORTER_PX, _EDGE_PX
         if frame.displayed:
             min_side_px, edge_px = _PICTURE_SIDE * config.min_side_px, 0.0
@@ -101,13 +101,13 @@ class BlindSearch:
         if SearchScales.FAINT in scales:
             half = with_columns_corrected(halved(frame.image), 0.5 * frame.noise)
             masks = (self._faint.mask(half if kind > 0.0 else -half, 0.5 * frame.noise, clear=clear) for kind in kinds)
-            found = [find_quads(mask, 0.5 * config.min_side_px + 2.0, halfway(hidden)) for mask in masks]
-            faint = 2.0 * np.concatenate(found) + 0.5
+            outlines = [find_quads(mask, 0.5 * config.min_side_px + 2.0, halfway(hidden)) for mask in masks]
+            faint = 2.0 * np.concatenate(outlines) + 0.5
         if len(fine) + len(faint) == 0:
             return Outlines.none()
         # A search at full resolution alone is for clear markers, which need no alignment.
         pull = SearchScales.FAINT in scales
-        reading, quads = self._read(frame, half, (fine, faint), allowed, seen.ids if pull else None)
+        reading, quads = self._read(frame, half, (fine, faint), allowed, found.ids if pull else None)
         good = accepted(reading, frame.noise, self._decoder.correctable, config)
         good &= (squared_sides(quads) >= min_side_px**2).all(axis=1)
         good &= frame.camera.contains(quads, CUT_OFF_PX).all(axis=1)
@@ -127,19 +127,19 @@ class BlindSearch:
         half: Float32Array,
         outlines: tuple[FloatArray, FloatArray],
         allowed: BoolArray,
-        seen: IntArray | None,
+        found_ids: IntArray | None,
     ) -> tuple[Reading, FloatArray]:
         """Readings of fine and faint outlines, and their corners (Q, 4, 2).
 
-        Doubtful ones are aligned with their pattern and read again, unless their IDs are ``seen`` already; None: none
-        is aligned.
+        Doubtful ones are aligned with their pattern and read again, unless their IDs are among ``found_ids``. Without
+        ``found_ids`` none is aligned.
         """
         decoder = self._decoder
         # Blur may merge a thin black border with the white on both sides: only the outline of the plate is left then.
         fine, faint = (_with_shrunk(quads, decoder.cells) for quads in outlines)
         quads = np.concatenate([fine, faint])
         reading = decoder.read(frame.image, fine, allowed).joined(decoder.read(half, halfway(faint), allowed))
-        rough = _NONE if seen is None else _rough(reading, quads, seen)
+        rough = _NONE if found_ids is None else _rough(reading, quads, found_ids)
         if len(rough) == 0:
             return reading, quads
         ids, turns = reading.ids[rough], reading.turns[rough]
@@ -171,15 +171,15 @@ def _chosen(reading: Reading, quads: FloatArray, places: IntArray, noise: float)
     return Outlines(reading.ids[places], corners, reading.contrast[places] / noise)
 
 
-def _rough(reading: Reading, quads: FloatArray, seen: IntArray) -> IntArray:
+def _rough(reading: Reading, quads: FloatArray, found_ids: IntArray) -> IntArray:
     """Indices of the best doubtful reading of each ID, away from clear readings: its outline may be inaccurate.
 
-    IDs that are ``seen`` already or that have a clear reading are left out.
+    IDs that are among ``found_ids`` or that have a clear reading are left out.
     """
     similarity = np.abs(reading.correlation)
     clear = similarity >= _CLEAR
     hinted = (similarity >= _HINT) & (similarity - reading.runner_up >= _HINT_MARGIN)
-    hinted &= ~among(reading.ids, np.concatenate([reading.ids[clear], seen]))
+    hinted &= ~among(reading.ids, np.concatenate([reading.ids[clear], found_ids]))
     places = np.flatnonzero(hinted)[np.argsort(-similarity[hinted], kind='stable')]
     places = places[np.unique(reading.ids[places], return_index=True)[1]]
     centre, across = quads.mean(axis=1), diagonals(quads[clear])

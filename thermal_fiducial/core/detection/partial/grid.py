@@ -19,11 +19,20 @@ from thermal_fiducial.core.detection.corners.segments import (
     robust_fit,
     UNMEASURED,
 )
-from thermal_fiducial.core.detection.corners.sides import Blur, blur_of, blurred_step, columns_across, NODES, Sides
+from thermal_fiducial.core.detection.corners.sides import (
+    Blur,
+    blur_of,
+    blurred_step,
+    columns_across,
+    EdgeModel,
+    NODES,
+    Sides,
+)
 from thermal_fiducial.core.detection.plates import outlines_on_faces
 from thermal_fiducial.core.detection.prediction.frame import counts_of, Frame, LEAST_DEPTH, Places, rolling_displacement
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.reprojection import retract
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, Stacked, TINY
 
 # Columns of pixels across an edge.
@@ -124,14 +133,14 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer, thick
     used = measured.variance[0] < UNMEASURED
     if used.sum() < 6:
         return None
-    J = _design(T, size, pattern, sides, modelled[2], layer.camera)
+    J = _design(T, size, pattern, sides, modelled.counting, layer.camera)
     sharpness = np.where(used, 1.0 / np.sqrt(measured.variance[0] + OF_SIDES_PX**2), 0.0)
     # So weak that it only keeps the system solvable.
     prior = TINY * np.diag((J[used] ** 2).sum(axis=0))
     fit = robust_fit((J * sharpness[:, None])[None], measured.shift * sharpness, used[None], prior)
     step = fit.moved[0, :, 0]
     return PoseFit(
-        se3.transform(se3.so3_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3]),
+        retract(T, step),
         fit.covariance[0],
         float(np.abs(J[used] @ step).max()),
         len(used),
@@ -150,8 +159,8 @@ def _outlines(T: FloatArray, size: float, pattern: GridEdges, thickness: float) 
     return outlines_on_faces(points, towards_white[:, None], camera[None], thickness)
 
 
-def _model(sides: Sides, step: FloatArray, blur: Blur) -> tuple[Float32Array, Float32Array, BoolArray]:
-    """White's share of every pixel but for a constant, its derivative by distance, whether it counts, (M, C, E, 1)."""
+def _model(sides: Sides, step: FloatArray, blur: Blur) -> EdgeModel:
+    """Model of edges that are straight steps, (M, C, E, 1), but near their ends and other edges."""
     sharpness, height = (1.0 / blur.width).astype(np.float32), step[:, None].astype(np.float32)
     value, slope = blurred_step(sides.distance, sharpness, height)
     ends = _QUIET * blur.along[0] / sides.along
@@ -159,7 +168,7 @@ def _model(sides: Sides, step: FloatArray, blur: Blur) -> tuple[Float32Array, Fl
     counting: BoolArray = np.asarray((np.abs(sides.distance) <= sides.across - _QUIET * blur.width) & straight)
     if sides.inside is not None:
         counting &= sides.inside
-    return value, slope, counting
+    return EdgeModel(value, slope, counting)
 
 
 def _design(

@@ -65,7 +65,7 @@ class _PartialMarker:
     cell_px: float
     unsure_cells: float
 
-    def seen(self) -> FloatArray:
+    def window_in_camera(self) -> FloatArray:
         """The window (4, 3) in the camera [m]."""
         return se3.apply(self.T_camera_marker, on_marker(self.window, self.size))
 
@@ -113,7 +113,7 @@ class PartialMarkerSearch:
     def _one(self, frame: Frame, marker: _PartialMarker, config: ArucoDetectorConfig) -> RefinedCorners | None:
         points = on_marker(self._visible.places, marker.size)
         factor = int(2 ** np.clip(np.floor(np.log2(marker.cell_px / _COARSE_PX)), 0, 3))
-        coarse = layer_of(frame, marker.seen(), config.blur_px, factor)
+        coarse = layer_of(frame, marker.window_in_camera(), config.blur_px, factor)
         T = self._moved(marker, points, coarse, marker.cell_px / factor)
         if T is None:
             return None
@@ -122,7 +122,7 @@ class PartialMarkerSearch:
         least_counts = config.guided_min_contrast * frame.noise
         if rough is None or self._contrast(rough, marker, coarse) < least_counts:
             return None
-        fine, fit = layer_of(frame, marker.seen(), config.blur_px), rough
+        fine, fit = layer_of(frame, marker.window_in_camera(), config.blur_px), rough
         for _ in range(_STEPS):
             step = adjusted(fit.T_camera_marker, marker.size, pattern, fine, config.plate_thickness)
             if step is None:
@@ -169,9 +169,9 @@ class PartialMarkerSearch:
         if similarity.max() < _HINT:
             return None
         shift = at + most_similar(similarity[None], near[None])[0]
-        seen = np.flatnonzero(layer.camera.contains(px))
-        J = pose_jacobian(marker.T_camera_marker, points[seen], layer.camera)[..., :3].reshape(-1, 3)
-        step = np.linalg.lstsq(J, np.tile(shift, len(seen)), rcond=1e-3)[0]
+        visible = np.flatnonzero(layer.camera.contains(px))
+        J = pose_jacobian(marker.T_camera_marker, points[visible], layer.camera)[..., :3].reshape(-1, 3)
+        step = np.linalg.lstsq(J, np.tile(shift, len(visible)), rcond=1e-3)[0]
         return se3.transform(marker.T_camera_marker[:3, :3], marker.T_camera_marker[:3, 3] + step)
 
     def _contrast(self, rough: PoseFit, marker: _PartialMarker, layer: Layer) -> float:
@@ -205,8 +205,7 @@ def _corners(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> RefinedCorne
     if not deviation < _KNOWN_PX:
         return None
     contrast, noise, doubt = (np.array([value]) for value in (fit.contrast, fit.noise, 0.0))
-    no = np.zeros(1, dtype=bool)
-    return RefinedCorners(corners[None], blocks[None], contrast, noise, doubt, no, no, no)
+    return RefinedCorners.by_edges(corners[None], blocks[None], contrast, noise, doubt)
 
 
 def _pose_covariance(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> FloatArray:

@@ -25,7 +25,7 @@ class VisibleCells:
     """
 
     def __init__(self, decoder: Decoder) -> None:
-        grids = decoder.seen(np.arange(decoder.count), np.zeros(decoder.count, dtype=np.int64))
+        grids = decoder.patterns(np.arange(decoder.count), np.zeros(decoder.count, dtype=np.int64))
         cells = decoder.cells + 2
         place = np.arange(cells**2).reshape(cells, cells)
         # The P pairs of neighbours, side by side and one above the other.

@@ -238,7 +238,7 @@ def motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlur
     mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
     if twist is None or (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
         return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
-    # So far the velocity has carried the image since its lag tail was seen, as the read-out shows it.
+    # Displacement of the image since its lag tail was recorded, stretched by the rolling shutter.
     tail = places.lag_blur(twist, frame.lag, LAG_TAIL_AGE)
     if frame.readout > 0.0:
         tail = tail * stretch(places, twist, frame)[..., None]

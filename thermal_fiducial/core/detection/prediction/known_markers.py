@@ -129,26 +129,29 @@ class KnownMarkers:
         rotated = self._corners_and_normals @ T_camera_map[:3, :3].T
         points, normal = rotated[:, :4] + T_camera_map[:3, 3], rotated[:, 4]
         corners = camera.project(points)
-        centre = points.mean(axis=1)
-        facing = (normal * centre).sum(axis=1) < -_MAX_TILT_COSINE * np.sqrt((centre * centre).sum(axis=1))
         large = (se3.squared_sides(corners) >= min_side_px**2).all(axis=1)
-        seen = np.flatnonzero(camera.contains(corners, CUT_OFF_PX).all(axis=1) & facing & large)
-        points = points[seen]
-        return ExpectedMarkers(self.ids[seen], points[..., :2] / points[..., 2:], points[..., 2], np.zeros(len(seen)))
+        in_view = camera.contains(corners, CUT_OFF_PX).all(axis=1)
+        visible = np.flatnonzero(in_view & large & _faces_camera(points.mean(axis=1), normal))
+        points = points[visible]
+        x, depth = points[..., :2] / points[..., 2:], points[..., 2]
+        return ExpectedMarkers(self.ids[visible], x, depth, np.zeros(len(visible)))
 
     def partially_visible(self, T_camera_map: FloatArray, camera: Camera, without: IntArray) -> PartialMarkers:
         """Markers that face the camera and are partially in view, except the IDs ``without``."""
         T = T_camera_map @ self.T_map_marker[self.ids]
-        centre, normal = T[:, :3, 3], T[:, :3, 2]
-        distance = np.sqrt(np.sum(centre * centre, axis=1))
-        facing = np.sum(normal * centre, axis=1) < -_MAX_TILT_COSINE * distance
-        corners = camera.project(se3.apply(T_camera_map, self._corners_and_normals[:, :4].reshape(-1, 3))).reshape(
-            -1, 4, 2
-        )
+        points = se3.apply(T_camera_map, self._corners_and_normals[:, :4].reshape(-1, 3))
+        corners = camera.project(points).reshape(-1, 4, 2)
         near = np.nan_to_num(corners, nan=-np.inf)
         low, high = near.min(axis=1), near.max(axis=1)
         inside = camera.contains(corners)
         overlap = inside.any(axis=1) | ((low < (camera.width, camera.height)) & (high > 0.0)).all(axis=1)
         whole = camera.contains(corners, _WHOLE_PX).all(axis=1)
+        facing = _faces_camera(T[:, :3, 3], T[:, :3, 2])
         some = np.flatnonzero(facing & overlap & ~whole & ~among(self.ids, without))
         return PartialMarkers(self.ids[some], T[some], self.sizes[self.ids[some]])
+
+
+def _faces_camera(centre: FloatArray, normal: FloatArray) -> BoolArray:
+    """Which markers face the camera, at no more than the largest tilt: centres and normals (N, 3) in the camera."""
+    distance = np.sqrt((centre * centre).sum(axis=1))
+    return np.asarray((normal * centre).sum(axis=1) < -_MAX_TILT_COSINE * distance)

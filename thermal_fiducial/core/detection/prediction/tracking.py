@@ -32,8 +32,9 @@ _JITTER_S = 0.001
 _DELAY_UNSURE = 0.5
 # Of the corners of a marker.
 _COORDINATES = 8
-# Odometry that gives the twist of a frame: from so many time constants before it to one after it, which is symmetric
-# about the velocity that blurs it; largest number of states; time constant that is assumed without lag [ns].
+# Odometry that gives the twist of a frame: from 3 time constants of the lag before the frame to one after it, a window
+# about the velocity of one time constant before, which causes the blur. Largest number of states; time constant that is
+# assumed without lag [ns].
 _LAGS_BEFORE, _STATES, _SHORTEST_LAG_NS = 3, 10, 5_000_000
 # Fewest states of that, since the noise of a gyroscope averages out; else those of so long before the frame [ns].
 _FEWEST, _LONGEST_NS = 4, 100_000_000
