@@ -10,7 +10,7 @@ from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import evaluate, Evaluation
 from thermal_fiducial.report.run_folder import read_run, SUMMARY
 
-__all__ = ['Evaluation', 'evaluate_run', 'write_report']
+__all__ = ['Evaluation', 'evaluate_run', 'write_page']
 
 REPORT, VIDEO = 'report.html', 'flight.mp4'
 
@@ -60,19 +60,14 @@ def evaluate_run(
     return evaluation, numbers
 
 
-def write_report(run_dir: Path, truth: Path | None = None, bag: Path | None = None) -> Path:
-    """Measure a run folder and write ``report.html`` into it; returns its path.
+def write_page(evaluation: Evaluation, numbers: dict[str, Any], bag: Path | None = None) -> Path:
+    """Write ``report.html`` of a measured run, with frames of ``bag`` (default: the replayed one); returns its path.
 
     Raises
     ------
     InputError
-        As :func:`evaluate_run`; or the plot libraries (extra ``tools``) are missing.
+        The file cannot be written, or the plot libraries (extra ``tools``) are missing.
     """
-    return write_page(*evaluate_run(run_dir, truth), bag)
-
-
-def write_page(evaluation: Evaluation, numbers: dict[str, Any], bag: Path | None = None) -> Path:
-    """Write ``report.html`` of a measured run, with frames of ``bag`` (default: the replayed one)."""
     require_packages()
     from thermal_fiducial.report.frames import strip
     from thermal_fiducial.report.html import render, report_page

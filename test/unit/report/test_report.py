@@ -15,7 +15,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.overview import cards
-from thermal_fiducial.report.page import evaluate_run, write_report
+from thermal_fiducial.report.page import evaluate_run, write_page
 from thermal_fiducial.report.run_folder import read_run
 from thermal_fiducial.report.table import number
 from thermal_fiducial.report.tables import tables
@@ -99,12 +99,12 @@ def test_truth_from_a_bag_is_the_truth_from_a_file(tmp_path, small_run):
 
 
 def test_the_same_run_gives_the_same_page(small_run):
-    assert write_report(small_run).read_bytes() == write_report(small_run).read_bytes()
+    assert write_page(*evaluate_run(small_run)).read_bytes() == write_page(*evaluate_run(small_run)).read_bytes()
 
 
 def test_words_of_others_are_escaped(small_run):
     (small_run / 'summary.json').write_text(json.dumps({'bag': '<script>alert(1)</script>'}))
-    assert '<script>alert' not in write_report(small_run).read_text()
+    assert '<script>alert' not in write_page(*evaluate_run(small_run)).read_text()
 
 
 @pytest.mark.parametrize('kept', [('fused.tum', 'fiducial.tum'), ('fused.tum', 'fiducial.tum', 'detections.csv')])
@@ -112,7 +112,7 @@ def test_a_bare_run_has_a_report(small_run, kept):
     for path in small_run.iterdir():
         if path.name not in kept:
             path.unlink()
-    assert 'id="chart-detections"' in write_report(small_run).read_text()
+    assert 'id="chart-detections"' in write_page(*evaluate_run(small_run)).read_text()
 
 
 def test_a_run_in_which_nothing_came_out_has_a_report(tmp_path):
@@ -122,14 +122,14 @@ def test_a_run_in_which_nothing_came_out_has_a_report(tmp_path):
     evaluation, numbers = evaluate_run(tmp_path)
     assert numbers['fused'] == {'poses': 0}
     assert [card.name for card in cards(evaluation, numbers)] == ['Output', 'Markers']
-    assert write_report(tmp_path).is_file()
+    assert write_page(*evaluate_run(tmp_path)).is_file()
 
 
 def test_a_run_whose_map_stayed_empty_has_a_report(small_run):
     save_map(small_run / 'map_true.yaml', wall())
     save_map(small_run / 'marker_map.yaml', MarkerMap())
     assert 'map' not in evaluate_run(small_run)[1]
-    assert write_report(small_run).is_file()
+    assert write_page(*evaluate_run(small_run)).is_file()
 
 
 @pytest.mark.parametrize(('fixed', 'words'), [((2,), 'rms of 7 markers'), (range(2, 10), 'rms of 8 fixed markers')])
@@ -162,7 +162,7 @@ def test_a_fused_path_without_any_fiducial_pose(small_run):
     (small_run / 'fiducial.tum').write_text('')
     numbers = evaluate_run(small_run)[1]
     assert numbers['fiducial'] == {'poses': 0, 'path_length_m': 0.0}
-    assert write_report(small_run).is_file()
+    assert write_page(*evaluate_run(small_run)).is_file()
 
 
 # --- bad input -----------------------------------------------------------------------------------------
@@ -244,7 +244,7 @@ def test_a_bag_without_truth_is_refused_by_the_name_of_the_topic(run_folder, cap
 def test_a_report_that_cannot_be_written_is_an_input_error(small_run):
     (small_run / 'report.html').mkdir()
     with pytest.raises(InputError, match=r'report\.html'):
-        write_report(small_run)
+        write_page(*evaluate_run(small_run))
 
 
 # --- command -------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from thermal_fiducial.files.images import stamp_to_ns
 from thermal_fiducial.report import video
 from thermal_fiducial.report.frames import bag_of, strip, ThermalView, write
 from thermal_fiducial.report.interruptions import Cause, Interruption
-from thermal_fiducial.report.page import write_report
+from thermal_fiducial.report.page import evaluate_run, write_page
 from thermal_fiducial.report.run_folder import read_run
 
 SECONDS = 0.4
@@ -83,7 +83,7 @@ def test_a_strip_shows_frames_with_their_markers(flight):
 
 
 def test_the_page_holds_the_strip(flight):
-    page = write_report(flight / 'run').read_text()
+    page = write_page(*evaluate_run(flight / 'run')).read_text()
     assert page.count('<img src="data:image/webp;base64,') == len(strip(read_run(flight / 'run')))
     assert '4 markers</figcaption>' in page
     # A picture that is loaded when it is reached takes no room until then: links jumped past their sections.
@@ -94,7 +94,7 @@ def test_the_video_shows_a_frame_before_it_is_played(flight, tmp_path):
     """On phones and in a page on paper it was a black square."""
     shutil.copytree(flight / 'run', tmp_path / 'run')
     (tmp_path / 'run' / 'flight.mp4').write_bytes(b'')
-    page = write_report(tmp_path / 'run').read_text()
+    page = write_page(*evaluate_run(tmp_path / 'run')).read_text()
     assert re.search(r'<video [^>]*src="flight.mp4" poster="data:image/webp;base64,', page)
 
 
@@ -106,7 +106,7 @@ def test_a_missing_bag_is_reported_and_another_path_can_be_given(flight, tmp_pat
     (tmp_path / 'run' / 'summary.json').write_text(json.dumps({'bag': 'nowhere', 'bag_path': '/nowhere'}))
     moved = read_run(tmp_path / 'run')
     assert (bag_of(moved), strip(moved)) == (None, [])
-    assert 'the bag is not where it was (--bag names it)' in write_report(tmp_path / 'run').read_text()
+    assert 'the bag is not where it was (--bag names it)' in write_page(*evaluate_run(tmp_path / 'run')).read_text()
     assert len(strip(moved, flight / 'bag')) > 5
     assert main(['evaluate', str(tmp_path / 'run'), '--video', '--no-report']) == 2
     assert '--bag names it' in capsys.readouterr().err

@@ -14,7 +14,7 @@ pytest.importorskip('plotly')
 
 import plotly.graph_objects as go
 
-from thermal_fiducial.report.page import evaluate_run, write_page, write_report
+from thermal_fiducial.report.page import evaluate_run, write_page
 from thermal_fiducial.report.time_plots import FIDUCIAL, FUSED
 
 CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
@@ -31,7 +31,7 @@ def run_folder(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def page(run_folder):
-    return write_report(run_folder).read_text()
+    return write_page(*evaluate_run(run_folder)).read_text()
 
 
 def without_library(page):
@@ -168,7 +168,7 @@ def test_figures_of_the_diagnostics_are_not_shown_beside_those_of_all_poses(run_
 def test_without_truth_there_are_no_errors_rather_than_false_ones(tmp_path):
     run = make_run(tmp_path / 'run', seconds=3.0, gap=(1.0, 1.5), with_output=False, with_truth=False)
     (run / 'latency.csv').unlink()
-    page = write_report(run).read_text()
+    page = write_page(*evaluate_run(run)).read_text()
     assert 'without ground truth' in page
     assert 'how large the errors are is not known' in page
     assert list(figures(page)) == ['scene', 'position', 'attitude', 'detections']
@@ -196,7 +196,7 @@ def test_nothing_is_wider_than_a_phone(run_folder, tmp_path):
     (run / 'summary.json').write_text(
         json.dumps(json.loads((run / 'summary.json').read_text()) | {'diagnostics': said})
     )
-    page = without_library(write_report(run).read_text())
+    page = without_library(write_page(*evaluate_run(run)).read_text())
     assert 'rad/s/sqrt(Hz)' in page
     assert run.name in page
     (tmp_path / 'report.html').write_text(re.sub(r'<script>.*?</script>', '', page, flags=re.DOTALL))
@@ -218,7 +218,7 @@ def test_nothing_is_wider_than_a_phone(run_folder, tmp_path):
 @pytest.mark.skipif(CHROMIUM is None, reason='no chromium')
 def test_a_browser_draws_every_chart(run_folder, tmp_path):
     """Without a graphics card, as CI has none: the view in space may stay empty, all else is drawn."""
-    path = write_report(run_folder)
+    path = write_page(*evaluate_run(run_folder))
     command = [
         CHROMIUM, '--headless=new', '--no-sandbox', '--disable-gpu', '--disable-3d-apis', '--no-first-run',
         f'--user-data-dir={tmp_path}', '--window-size=1300,1000', '--virtual-time-budget=10000', '--dump-dom',
