@@ -10,6 +10,7 @@ import pytest
 from support import small_bag
 
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.files.bags import IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map
 
 pytest.importorskip('distributed', reason='the extra "batch" is not installed')
@@ -108,11 +109,31 @@ def test_a_map_of_something_else_is_not_overwritten(folder, capfd):
     assert contents(folder / 'mine') == {Path('marker_map.yaml'): b'mine'}
 
 
-def test_no_folder_is_left_where_no_bag_could_be_replayed(folder, capfd):
+def test_all_arguments_that_are_no_bags_are_named_before_any_is_replayed(folder, capfd):
+    """A folder without a bag, another file, and a bag without an IMU: as by a pattern that matches too much."""
     (folder / 'empty').mkdir()
-    assert batch(folder, 'nothing', bags=('empty',)) == 2
-    assert 'empty: no bag' in capfd.readouterr().err
+    small_bag.recording(seconds=0.1).without(IMU_TOPIC).write(folder / 'no_imu')
+    assert batch(folder, 'nothing', bags=('flight0', 'empty', 'map.yaml', 'no_imu')) == 2
+    error = capfd.readouterr().err
+    assert error.count('\n') == 1
+    for words in ('empty: no bag', 'map.yaml: no bag', 'no_imu: no topic imu/data'):
+        assert words in error
     assert not (folder / 'nothing').exists()
+
+
+def test_no_folder_is_left_where_no_bag_could_be_replayed(folder, capfd):
+    damaged(folder / 'damaged')
+    assert batch(folder, 'none', bags=('damaged',)) == 2
+    assert 'damaged' in capfd.readouterr().err
+    assert not (folder / 'none').exists()
+
+
+def damaged(path):
+    """A bag that only shows while it is played that a message of it is none."""
+    recording = small_bag.recording(seconds=0.2)
+    index = next(i for i, event in enumerate(recording.events) if event[1] == IMAGE_TOPIC)
+    recording.events[index] = (*recording.events[index][:2], small_bag.Raw('sensor_msgs/msg/Image', b'\0' * 8))
+    recording.write(path)
 
 
 def test_a_scheduler_that_is_not_there(folder, capfd):
@@ -123,7 +144,7 @@ def test_a_scheduler_that_is_not_there(folder, capfd):
 def test_a_bad_bag_is_named_and_the_others_are_replayed_by_a_cluster_that_is_there(folder, alone, capfd):
     from distributed import LocalCluster
 
-    (folder / 'broken').mkdir(exist_ok=True)
+    damaged(folder / 'broken')
     bags = ('flight0', 'broken')
     local = {'processes': False, 'protocol': 'tcp://', 'dashboard_address': ':0', 'silence_logs': 50}
     with LocalCluster(n_workers=1, threads_per_worker=1, **local) as cluster:

@@ -27,7 +27,7 @@ from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.writing import into, write_text
 from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.replay.earlier_runs import refuse_other_folder
-from thermal_fiducial.replay.session import MAP_FILE, Options, replay
+from thermal_fiducial.replay.session import check, MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.ros.messages import clouds, convert
 
@@ -87,8 +87,18 @@ class Batch:
             refuse_other_folder(run.run)
         if (self.out / MAP_FILE).exists() and not (self.out / SUMMARY_FILE).exists():
             raise InputError(f'{self.out / MAP_FILE} is not of an earlier batch: choose another folder with --out')
-        mode = {} if self.options.mode is None else {'mode': self.options.mode}
-        read_settings(self.options.params, mode | {'map_file': str(self.options.map_file)})
+        self._check_bags(runs)
+
+    def _check_bags(self, runs: Sequence[Options]) -> None:
+        """Name all bags that cannot be replayed, rather than the first, and before hours of replays of the others."""
+        reasons: dict[str, None] = {}
+        for run in runs:
+            try:
+                check(run)
+            except InputError as error:
+                reasons[str(error)] = None
+        if reasons:
+            raise InputError('; '.join(reasons))
 
 
 @contextmanager

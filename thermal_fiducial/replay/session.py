@@ -71,10 +71,8 @@ def replay(
         removed, except parameters and map.
     """
     settings = _settings(options, warn)
-    with BagReader(options.bag, options.remaps, second_camera=options.second_camera) as bag:
-        entry = ENTRIES[options.entry] if options.entry else entry_of(bag.topics)
-        nodes, played, recorded = _cast(entry, settings, images=options.images)
-        bag.require({topic: type_name(kind) for topic, (kind, _) in played.items()})
+    with _bag_of(options) as bag:
+        entry, nodes, played, recorded = _cast(bag, options, settings)
         also = {topic: PLAYED[topic] for topic in entry.also if topic in bag.topics}
         settings = _with_transport(settings, entry)
         arguments = _prepare(options, settings, entry, warn)
@@ -92,7 +90,32 @@ def replay(
     return summary
 
 
-def _cast(entry: Entry, settings: Settings, *, images: bool) -> tuple[tuple[str, ...], Topics, Topics]:
+def check(options: Options) -> None:
+    """Raise InputError for a bag, parameter or file that :func:`replay` would refuse before it plays the bag."""
+    settings = _settings(options, lambda _: None)
+    with _bag_of(options) as bag:
+        _cast(bag, options, settings)
+
+
+def _bag_of(options: Options) -> BagReader:
+    return BagReader(options.bag, options.remaps, second_camera=options.second_camera)
+
+
+def _cast(bag: BagReader, options: Options, settings: Settings) -> tuple[Entry, tuple[str, ...], Topics, Topics]:
+    """The stage at which the bag enters, the nodes to run, the topics to play, and the topics to record.
+
+    Raises
+    ------
+    InputError
+        A topic to play that the bag lacks.
+    """
+    entry = ENTRIES[options.entry] if options.entry else entry_of(bag.topics)
+    nodes, played, recorded = _cast_from(entry, settings, images=options.images)
+    bag.require({topic: type_name(kind) for topic, (kind, _) in played.items()})
+    return entry, nodes, played, recorded
+
+
+def _cast_from(entry: Entry, settings: Settings, *, images: bool) -> tuple[tuple[str, ...], Topics, Topics]:
     """The nodes to run, the topics that the bag must have, and the topics to record.
 
     Raises
