@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar='BAG-or-TUM',
         help='ground truth: a TUM file, or a bag with ground_truth/odometry (default: truth.tum in RUN, or '
-        'ground_truth.tum in the bag that was replayed, if any)',
+        'ground_truth.tum in the bag that was replayed, or beside its single file, if any)',
     )
     parser.add_argument(
         '--truth-map',

@@ -23,8 +23,8 @@ from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
 FUSED, FIDUCIAL, TRUTH, TRUTH_OF_BAG = 'fused.tum', 'fiducial.tum', 'truth.tum', 'ground_truth.tum'
 DETECTIONS, LATENCY, PARAMETERS = 'detections.csv', 'latency.csv', 'parameters.yaml'
 MARKER_MAP, TRUE_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'map_true.yaml', 'summary.json', 'output'
-#: Longest cell of a number [characters]; limit of integers (int64).
-_LONGEST_CELL, _LARGEST_WHOLE = 40, 2**63
+#: Longest cell of a number [characters]; limits of integers (int64), and of stamps to which a duration is added [ns].
+_LONGEST_CELL, _LARGEST_WHOLE, _LARGEST_STAMP = 40, 2**63, 2**62
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
     ----------
     path : the folder
     truth : a TUM file or a bag; default: the folder's own ``truth.tum``, or ``ground_truth.tum`` in the bag that was
-        replayed, where there is one
+        replayed or beside its single file, where there is one
     true_map : a marker map; default: ``map_true.yaml`` in the truth's bag or beside its file, where there is one
 
     Raises
@@ -87,7 +87,7 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
     summary = read_summary(path / SUMMARY)
     truth = _own_truth(path, summary) if truth is None else truth
     if true_map is None and truth is not None:
-        beside = (truth if truth.is_dir() else truth.parent) / TRUE_MAP
+        beside = _folder_of(truth) / TRUE_MAP
         true_map = beside if beside.exists() else None
     offset_ns = _camera_time_offset_ns(path / PARAMETERS)
     return Run(
@@ -109,8 +109,13 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
 def _own_truth(path: Path, summary: dict[str, Any]) -> Path | None:
     """The truth of a run folder, or of the replayed bag."""
     bag = bag_of_run(path, summary)
-    places = [path / TRUTH, *([] if bag is None else [bag / TRUTH_OF_BAG])]
+    places = [path / TRUTH, *([] if bag is None else [_folder_of(bag) / TRUTH_OF_BAG])]
     return next((place for place in places if is_there(place)), None)
+
+
+def _folder_of(bag: Path) -> Path:
+    """The folder with what belongs to a bag: of a single file, the one that it lies in."""
+    return bag if bag.is_dir() else bag.parent
 
 
 def bag_of_run(path: Path, summary: dict[str, Any]) -> Path | None:
@@ -146,7 +151,7 @@ def read_summary(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
-        raise InputError(f'{path}: {one_line(error)}') from None
+        raise InputError(f'{path}: cut short or damaged, replay it again: {one_line(error)}') from None
     if not isinstance(content, dict):
         raise InputError(f'{path}: not a JSON object')
     for name, is_kind in _SUMMARY_KINDS.items():
@@ -157,6 +162,15 @@ def read_summary(path: Path) -> dict[str, Any]:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and abs(value) < _LARGEST_WHOLE
+
+
+def _is_duration(value: Any) -> bool:
+    """Seconds that also fit as nanoseconds, and so does their sum with a stamp."""
+    return _is_number(value) and abs(value) * SECOND_NS < _LARGEST_STAMP
+
+
+def _is_stamp(value: Any) -> bool:
+    return isinstance(value, int) and abs(value) < _LARGEST_STAMP
 
 
 def _is_text(value: Any) -> bool:
@@ -170,7 +184,8 @@ def _is_table_of(is_kind: Callable[[Any], bool]) -> Callable[[Any], bool]:
 #: Keys of a summary that the report reads, and their validation; others are ignored.
 _SUMMARY_KINDS: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(('bag', 'bag_path', 'mode', 'transport'), _is_text),
-    'duration_s': _is_number,
+    'start_ns': _is_stamp,
+    'duration_s': _is_duration,
     'cpu_percent': _is_table_of(_is_number),
     'diagnostics': _is_table_of(_is_table_of(_is_text)),
     'remaps': _is_table_of(_is_text),

@@ -37,12 +37,30 @@ def test_what_is_no_file_is_refused_in_one_line(small_run, tmp_path, capsys, nam
         assert line.count('\n') == 1
 
 
+@pytest.mark.parametrize('share', [0.0, 0.5, 0.99])
+def test_a_summary_that_is_cut_short_is_named_in_one_line(small_run, tmp_path, capsys, share):
+    """By a full disk or a battery that ran out, then copied without a look."""
+    run = shutil.copytree(small_run, tmp_path / 'run')
+    data = (run / 'summary.json').read_bytes()
+    (run / 'summary.json').write_bytes(data[: int(share * len(data))])
+    compared = [[str(small_run), '--compare']] if find_spec('evo') else []
+    for words in ([], *compared):
+        assert main(['evaluate', str(run), *words, '--no-report']) == 2
+        line = capsys.readouterr().err
+        assert f'{run / "summary.json"}: cut short or damaged' in line
+        assert line.count('\n') == 1
+
+
 @pytest.mark.parametrize(
     'field',
     [
         '"duration_s": "long"',
         '"duration_s": [1]',
         '"duration_s": NaN',
+        '"duration_s": 1e17',
+        '"start_ns": "then"',
+        '"start_ns": null',
+        '"start_ns": 1e400',
         '"diagnostics": [1]',
         '"diagnostics": {"a": 1}',
         '"diagnostics": {"marker_mapper": {"quarantined": {}}}',

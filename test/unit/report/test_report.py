@@ -216,11 +216,15 @@ def test_unusable_truth_is_refused(tmp_path, small_run, capsys, truth):
     assert error.count('\n') == 1
 
 
-def test_the_truth_in_the_bag_that_was_replayed_is_used_and_named(tmp_path, small_run, capsys):
+@pytest.mark.parametrize('replayed', ['bag', 'bag/bag_0.mcap'])
+def test_the_truth_in_the_bag_that_was_replayed_is_used_and_named(tmp_path, small_run, capsys, replayed):
+    """Also where a single file of the bag was replayed, beside which the truth lies."""
     bag = tmp_path / 'bag'
     bag.mkdir()
+    (bag / 'bag_0.mcap').touch()
     (small_run / 'truth.tum').rename(bag / 'ground_truth.tum')
-    (small_run / 'summary.json').write_text(json.dumps({'bag': 'bag', 'bag_path': str(bag)}))
+    place = tmp_path / replayed
+    (small_run / 'summary.json').write_text(json.dumps({'bag': place.name, 'bag_path': str(place)}))
     assert main(['evaluate', str(small_run), '--no-report']) == 0
     printed = capsys.readouterr().out
     assert f'ground truth: {bag / "ground_truth.tum"}' in printed
