@@ -3,6 +3,8 @@
 import os
 from pathlib import Path
 import signal
+import subprocess
+import sys
 import threading
 import time
 
@@ -153,3 +155,31 @@ def test_a_bad_bag_is_named_and_the_others_are_replayed_by_a_cluster_that_is_the
     assert len(lines) == 1
     assert lines[0].count('broken') == 1
     assert contents(folder / 'cluster' / 'flight0') == contents(alone / 'flight0')
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize('after_s', [0.0, 1.0, 5.0])
+def test_two_interrupts_of_the_terminal_are_one_line_and_leave_nothing(folder, after_s):
+    """While workers import what they need, while the cluster connects, and while bags are replayed."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    words = ['batch', folder / 'flight0', folder / 'flight1', '--out', folder / 'interrupted', '--workers', '2']
+    words += ['--map', folder / 'map.yaml', '--params', folder / 'params.yaml']
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'thermal_fiducial', *map(str, words)],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    while process.poll() is None and not _workers_of(process.pid):
+        time.sleep(0.05)
+    time.sleep(after_s)
+    for _ in range(2):
+        os.killpg(process.pid, signal.SIGINT)
+        time.sleep(0.3)
+    # Workers that stay would hold the pipe.
+    error = process.communicate(timeout=60)[1]
+    # For a shell both are 130.
+    assert process.returncode in (130, -signal.SIGINT)
+    assert error.splitlines()[-1] == 'thermal-fiducial batch: interrupted'
+    assert 'Traceback' not in error
+    assert not (folder / 'interrupted').exists()

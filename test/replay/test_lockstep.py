@@ -1,11 +1,14 @@
 """Replay in lock-step: complete, deterministic, equal to the offline pipeline, robust against bad bags."""
 
 import json
+import os
+import signal
 import time
 
 import numpy as np
 import pytest
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.serialization import deserialize_message
 from support import small_bag
 
 from thermal_fiducial.cli.main import main
@@ -17,7 +20,7 @@ from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPI
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.trajectory_file import load_tum, tum_line
-from thermal_fiducial.replay import lockstep, waiting
+from thermal_fiducial.replay import lockstep, recorder, waiting
 from thermal_fiducial.replay.recorder import RunFiles
 from thermal_fiducial.ros.messages import convert
 
@@ -233,3 +236,26 @@ def test_a_callback_of_any_length_ends_nothing(folder, tmp_path, monkeypatch, ca
     summary = json.loads((tmp_path / 'run' / 'summary.json').read_text())
     assert summary['messages_out']['markers'] == summary['messages_in'][IMAGE_TOPIC] == 9
     assert 'Traceback' not in capfd.readouterr().err
+
+
+def test_an_interrupt_while_a_message_is_converted_is_one_line_and_leaves_no_half_a_run(
+    folder, tmp_path, monkeypatch, capfd
+):
+    """rclpy makes a TypeError of the KeyboardInterrupt that would be raised there."""
+
+    def interrupted(data, kind):
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            raise TypeError('Unable to convert function return value') from None
+        return deserialize_message(data, kind)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        monkeypatch.setattr(recorder, 'deserialize_message', interrupted)
+        assert replay(folder / 'bag', tmp_path / 'run', folder) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capfd.readouterr().err.splitlines()[-1] == 'thermal-fiducial replay: interrupted'
+    left = {path.name for path in (tmp_path / 'run').iterdir()}
+    assert left <= {'parameters.yaml', 'marker_map.yaml', 'marker_map.yaml.history'}

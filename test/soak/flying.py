@@ -39,7 +39,7 @@ def soak(
         play = partial(replay_processes, rate=1.0, say=say)
     recorded = ENTRIES['images'].recorded(calibration_from_file=False, images=False)
     played = {topic: PLAYED[topic] for topic in TOPICS}
-    play(ReplayJob(laps, tuple(NODES), played, errors, recorded, arguments, meter, lines.append))
+    play(ReplayJob(laps, tuple(NODES), played, errors, recorded, arguments, meter, lines.append, lambda: None))
     saved = sorted(load_map(map_file).markers)
     expected = [marker.id for marker in laps.scenario.markers]
     if saved != expected:

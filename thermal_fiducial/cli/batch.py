@@ -58,7 +58,8 @@ def run(args: argparse.Namespace) -> int:
     )
     batch = Batch(tuple(args.bags), args.out, options, args.max_frames)
     batch.check()
-    with workers(min(args.workers, len(args.bags)), args.scheduler) as client, progress_bar('batch') as progress:
+    count = min(args.workers, len(args.bags))
+    with batch.cleared_up(), workers(count, args.scheduler) as client, progress_bar('batch') as progress:
         summary = run_batch(batch, client, progress, lambda line: print(f'warning: {line}', file=sys.stderr))
     runs = '1 run' if len(summary['runs']) == 1 else f'{len(summary["runs"])} runs'
     print(

@@ -6,6 +6,7 @@ import errno
 from importlib import import_module
 from io import TextIOWrapper
 import os
+import signal
 import sys
 from typing import Any, NoReturn
 
@@ -13,6 +14,7 @@ from thermal_fiducial import __version__
 from thermal_fiducial.cli.subcommands import add_command
 from thermal_fiducial.errors import InputError, RunError
 from thermal_fiducial.files.reading import shown
+from thermal_fiducial.ros.process.interrupts import Interrupts
 
 PROGRAM = 'thermal-fiducial'
 INSTALL_HINT = "pip install '.[tools,ros]' in the package's folder, or apt on the robot"
@@ -38,6 +40,9 @@ _REFUSED = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
     *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR),
 )
+
+#: Exit status of an interrupted command, as a shell has it for SIGINT.
+INTERRUPTED = 130
 
 #: Modules of commands with a name that no module can have.
 MODULES = {'import': 'import_recording'}
@@ -84,8 +89,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     Exit status: 0 done, 1 something failed on the way, 2 wrong usage or unusable input, 130 interrupted.
     """
-    argv = sys.argv[1:] if argv is None else list(argv)
+    words = sys.argv[1:] if argv is None else list(argv)
     _allow_any_letter()
+    with Interrupts(held=False) as interrupts:
+        status = _finished(words, interrupts)
+    if argv is None and status == INTERRUPTED:
+        # All is cleared up: a further interrupt may end the process in the middle of the interpreter's own end.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    return status
+
+
+def _finished(argv: Sequence[str], interrupts: Interrupts) -> int:
+    """Run a command to its end or its error; returns the exit status."""
     try:
         status = _run(argv)
         sys.stdout.flush()
@@ -93,8 +108,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         _discard_output()
         return 0
-    except (InputError, RunError, ImportError, OSError, KeyboardInterrupt) as error:
-        found = _reported(error)
+    except (Exception, KeyboardInterrupt) as error:
+        # Libraries in C turn an interrupt into errors of their own.
+        found = _reported(KeyboardInterrupt() if interrupts.asked else error)
         if found is None:
             raise
         status, words = found
@@ -125,7 +141,7 @@ def _reported(error: BaseException) -> tuple[int, str] | None:
     if isinstance(error, InputError | RunError):
         return 2 if isinstance(error, InputError) else 1, str(error)
     if isinstance(error, KeyboardInterrupt):
-        return 130, 'interrupted'
+        return INTERRUPTED, 'interrupted'
     if isinstance(error, ModuleNotFoundError) and error.name and error.name.partition('.')[0] != 'thermal_fiducial':
         return 2, f'needs the Python package {error.name}: {INSTALL_HINT}'
     if isinstance(error, OSError) and error.errno in _REFUSED:

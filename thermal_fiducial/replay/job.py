@@ -21,6 +21,7 @@ class ReplayJob:
     ros_arguments : for the nodes, after ``--ros-args``
     progress : called with the bag's time [ns since its start]
     warn : called with a message on a long wait without progress
+    check_interrupt : raises KeyboardInterrupt if the user has pressed Ctrl-C, which is raised nowhere else
     """
 
     bag: Playable
@@ -31,3 +32,4 @@ class ReplayJob:
     ros_arguments: Sequence[str]
     progress: Callable[[int], None]
     warn: Callable[[str], None]
+    check_interrupt: Callable[[], None]

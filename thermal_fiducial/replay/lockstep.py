@@ -152,6 +152,7 @@ class _Graph:
         """Run callbacks until ``missing`` returns nothing, however long one callback takes."""
         wait = Wait(lambda: f'messages on {", ".join(missing())}', self._job.warn)
         while missing():
+            self._job.check_interrupt()
             self._executor.spin_once(timeout_sec=_POLL_S)
             for stage in self._stages:
                 stage.take_waiting()

@@ -5,12 +5,14 @@ of its bag. Run folders appear atomically.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import dataclass, replace
 import json
 import logging
+from multiprocessing import resource_tracker
 from pathlib import Path
 import shutil
+import signal
 import tempfile
 from typing import Any
 
@@ -30,6 +32,7 @@ from thermal_fiducial.replay.earlier_runs import refuse_other_folder
 from thermal_fiducial.replay.session import check, MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.ros.messages import clouds, convert
+from thermal_fiducial.ros.process.interrupts import Interrupts
 
 #: Written last; it and the map of an earlier batch are deleted before the first replay.
 SUMMARY_FILE = 'batch.json'
@@ -89,6 +92,19 @@ class Batch:
             raise InputError(f'{self.out / MAP_FILE} is not of an earlier batch: choose another folder with --out')
         self._check_bags(runs)
 
+    @contextmanager
+    def cleared_up(self) -> Iterator[None]:
+        """Remove at the end what workers that died or were interrupted have left; all workers must have ended."""
+        try:
+            yield
+        finally:
+            for run in self.runs():
+                for unfinished in run.run.parent.glob(f'.{run.run.name}-*'):
+                    shutil.rmtree(unfinished, ignore_errors=True)
+            # Empty if no bag was replayed.
+            with suppress(OSError):
+                self.out.rmdir()
+
     def _check_bags(self, runs: Sequence[Options]) -> None:
         """Name all bags that cannot be replayed, rather than the first, and before hours of replays of the others."""
         reasons: dict[str, None] = {}
@@ -121,12 +137,34 @@ def workers(count: int, scheduler: str = '') -> Iterator[Any]:
         with client:
             yield client
         return
-    with dask.config.set(_PATIENT):
-        cluster = LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=':0', silence_logs=logging.CRITICAL
-        )
-        with cluster, Client(cluster) as client:
-            yield client
+    with dask.config.set(_PATIENT), ExitStack() as ending:
+        # Half a cluster ends with tracebacks of its own.
+        with Interrupts(held=True), _blocked_in_children():
+            cluster = LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=':0',
+                silence_logs=logging.CRITICAL,
+            )
+            ending.enter_context(cluster)
+            client = ending.enter_context(Client(cluster))
+        yield client
+
+
+@contextmanager
+def _blocked_in_children() -> Iterator[None]:
+    """Let processes that are started meanwhile, and those that threads of theirs start later, never get SIGINT.
+
+    Ctrl-C reaches all processes of a terminal; only the first of them is to act on it.
+    """
+    # Python's helper of spawned processes, started here if there is none yet, would unblock it.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def run_batch(
@@ -157,13 +195,7 @@ def run_batch(
     if batch.options.map_file is None:
         raise InputError('a joint map needs --map with at least one marker of known pose')
     _prepare_folder(batch.out)
-    try:
-        _replay_all(runs, client, progress, warn)
-    except (InputError, RunError):
-        # Empty if no bag was replayed.
-        with suppress(OSError):
-            batch.out.rmdir()
-        raise
+    _replay_all(runs, client, progress, warn)
     built, frames = _joint_map(batch, runs, settings)
     save_map(batch.out / MAP_FILE, built.map)
     summary = _summary_of(built) | {'runs': [run.run.name for run in runs], 'frames': frames}
@@ -207,9 +239,6 @@ def _replay_all(
             warnings[name] = future.result()
         progress(done / len(runs))
     for run in runs:
-        # Unfinished folders of a worker that died.
-        for unfinished in run.run.parent.glob(f'.{run.run.name}-*'):
-            shutil.rmtree(unfinished, ignore_errors=True)
         for line in warnings.get(run.run.name, []):
             warn(f'{run.run.name}: {line}')
     errors = [_as_error(run, failures[run.run.name]) for run in runs if run.run.name in failures]

@@ -137,6 +137,7 @@ class _Player:
             *(source.topic for source in self._recorder.inputs if source.publishers < 1),
         ]:
             processes.check()
+            self._job.check_interrupt()
             self._executor.spin_once(timeout_sec=0.05)
             wait.go_on(missing)
         deadline = time.monotonic() + _MATCHING_S
@@ -151,6 +152,7 @@ class _Player:
         for message in _read_ahead(bag.messages(self._outputs)):
             due_ns = clock.due_ns(message.stamp_ns)
             self._spin_until(due_ns, clock)
+            self._job.check_interrupt()
             now = time.monotonic_ns()
             late_ns = max(late_ns, now - due_ns)
             if message.topic in _KINDS:
@@ -198,6 +200,7 @@ class _Player:
 
     def _spin_until(self, due_ns: int, clock: _Clock) -> None:
         while (left := due_ns - time.monotonic_ns()) > 0:
+            self._job.check_interrupt()
             if self._arrived and left > _SPARE_NS:
                 self._executor.spin_once(timeout_sec=0.0)
                 self._file_one(clock)

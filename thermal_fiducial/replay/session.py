@@ -22,6 +22,7 @@ from thermal_fiducial.replay.processes import replay_processes
 from thermal_fiducial.replay.recorder import refuse_folder_in_use, RunFiles
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED, Topics, type_name
+from thermal_fiducial.ros.process.interrupts import Interrupts
 
 MAP_FILE, SUMMARY_FILE = 'marker_map.yaml', 'summary.json'
 
@@ -76,17 +77,21 @@ def replay(
         also = {topic: PLAYED[topic] for topic in entry.also if topic in bag.topics}
         settings = _with_transport(settings, entry)
         arguments = _prepare(options, settings, entry, warn)
-        with into(options.run), RunFiles(options.run, camera_in_body(settings.pose_ekf), recorded) as files:
-            in_real_time = partial(replay_processes, rate=options.rate, say=say)
-            play = in_real_time if options.transport == 'processes' else replay_lockstep
-            done = partial(_show_share, progress, max(bag.duration_ns, 1))
-            job = ReplayJob(bag, nodes, also | played, files, recorded, arguments, done, warn)
-            timing = play(job)
-            _report_refusals(files, entry, nodes, warn)
-        _report_silence(files, nodes, warn)
-        marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)
-        summary = _summary(options, settings, bag, played, files) | {'markers_in_map': len(marker_map.markers)} | timing
-    write_text(options.run / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
+        # Files of a run are whole, or none are there.
+        with Interrupts(held=True) as interrupts:
+            with into(options.run), RunFiles(options.run, camera_in_body(settings.pose_ekf), recorded) as files:
+                in_real_time = partial(replay_processes, rate=options.rate, say=say)
+                play = in_real_time if options.transport == 'processes' else replay_lockstep
+                done = partial(_show_share, progress, max(bag.duration_ns, 1))
+                check_interrupt = interrupts.check
+                job = ReplayJob(bag, nodes, also | played, files, recorded, arguments, done, warn, check_interrupt)
+                timing = play(job)
+                _report_refusals(files, entry, nodes, warn)
+            _report_silence(files, nodes, warn)
+            marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)
+            own = {'markers_in_map': len(marker_map.markers)}
+            summary = _summary(options, settings, bag, played, files) | own | timing
+            write_text(options.run / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
     return summary
 
 

@@ -1,0 +1,117 @@
+"""Ctrl-C of commands: once, where it breaks nothing, and said in one line."""
+
+import os
+import signal
+import threading
+
+import pytest
+
+from thermal_fiducial.cli import main as program
+from thermal_fiducial.ros.process import interrupts
+from thermal_fiducial.ros.process.interrupts import Interrupts
+
+
+@pytest.fixture(autouse=True)
+def pythons_own_handler():
+    """A shell's background jobs ignore the signal from the start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
+
+
+def press():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def test_a_second_one_does_not_interrupt_the_clearing_up():
+    cleared_up = []
+
+    def work():
+        try:
+            press()
+        finally:
+            press()
+            cleared_up.append(True)
+
+    with pytest.raises(KeyboardInterrupt), Interrupts(held=False):
+        work()
+    assert cleared_up
+
+
+def test_one_that_a_library_has_swallowed_can_be_repeated(monkeypatch):
+    monkeypatch.setattr(interrupts, 'PAUSE_S', 0.0)
+    with Interrupts(held=False):
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                press()
+
+
+def test_a_held_one_is_raised_by_a_check():
+    with pytest.raises(KeyboardInterrupt), Interrupts(held=True) as held:
+        check_around(held, press)
+    assert held.asked
+
+
+def check_around(held, act):
+    """An action between two checks, of which the first one must raise nothing."""
+    held.check()
+    act()
+    assert held.asked
+    held.check()
+    pytest.fail('nothing was raised')
+
+
+def test_a_held_one_is_raised_at_the_end():
+    with pytest.raises(KeyboardInterrupt), Interrupts(held=True):
+        press()
+
+
+def fail():
+    press()
+    raise ValueError('of another process')
+
+
+def test_errors_after_it_are_consequences_of_it():
+    """A node of the same terminal that has had it too, for example."""
+    with pytest.raises(KeyboardInterrupt), Interrupts(held=True):
+        fail()
+
+
+def test_errors_without_it_are_errors():
+    with pytest.raises(ValueError, match='own'), Interrupts(held=True):
+        raise ValueError('own')
+
+
+def test_a_job_in_the_background_of_a_shell_goes_on_ignoring_it():
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with Interrupts(held=True) as held:
+        press()
+        assert not held.asked
+    assert signal.signal(signal.SIGINT, signal.default_int_handler) is signal.SIG_IGN
+
+
+def test_in_another_thread_it_does_nothing():
+    def work():
+        with Interrupts(held=True):
+            done.append(True)
+
+    done = []
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert done
+
+
+def test_a_command_says_that_it_was_interrupted_whatever_a_library_makes_of_it(monkeypatch, capsys):
+    """The conversions of rclpy raise a TypeError in its place."""
+
+    def convert(argv):
+        try:
+            press()
+        except KeyboardInterrupt:
+            raise TypeError('Unable to convert function return value') from None
+
+    monkeypatch.setattr(program, '_run', convert)
+    assert program.main(['replay']) == 130
+    assert capsys.readouterr().err == 'thermal-fiducial replay: interrupted\n'
