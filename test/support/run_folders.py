@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
-from thermal_fiducial.core.filter.verdicts import PoseUpdate
+from thermal_fiducial.core.filter.belief import PoseUpdate
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.files.bag_writer import BagWriter

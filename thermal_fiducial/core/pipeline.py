@@ -20,8 +20,8 @@ from thermal_fiducial.config import (
 )
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.detection.patterns import Dictionary
+from thermal_fiducial.core.filter.belief import PoseUpdate
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import (
     quaternion_from_rotation,

@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 
-from thermal_fiducial.core.filter.verdicts import PoseUpdate
+from thermal_fiducial.core.filter.belief import PoseUpdate
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 #: Keys of the filter's diagnostics: normalised innovations; why the last pose was refused, until one is accepted.

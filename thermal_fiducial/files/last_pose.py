@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from thermal_fiducial.core.filter.restart import HINT_SECONDS, LastPose
+from thermal_fiducial.core.filter.initialization import HINT_SECONDS, LastPose
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_text

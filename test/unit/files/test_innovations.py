@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.filter.verdicts import PoseUpdate
+from thermal_fiducial.core.filter.belief import PoseUpdate
 from thermal_fiducial.files.innovations import innovations_of, innovations_text
 
 STAMP = 1_700_000_000_123_456_789

@@ -10,34 +10,14 @@ from support import small_bag
 from support.messages import imu, pose
 from support.ros_graph import ros_graph
 
-from thermal_fiducial.core.filter.restart import LastPose, RestartHint
+from thermal_fiducial.core.filter.initialization import LastPose
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
-from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.last_pose import recent_pose, save_last_pose
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 
 SECOND = 1_000_000_000
 LAST = LastPose(5 * SECOND, transform(so3_exp([0.0, 0.0, 0.3]), [1.0, 2.0, 3.0]), 0.004)
-
-
-def camera_pose(seconds, x):
-    return CameraPose(LAST.stamp_ns + round(seconds * SECOND), transform(np.eye(3), [x, 2.0, 3.0]), np.eye(6))
-
-
-def test_a_pose_that_no_flight_could_have_reached_is_kept_out_for_a_second():
-    hint = RestartHint(LAST, np.eye(4))
-    assert hint.contradiction(camera_pose(1.0, 1.2)) == 0.0
-    assert hint.contradiction(camera_pose(1.0, 9.0)) == pytest.approx(8.0)
-    # Three metres a second, not more.
-    assert hint.contradiction(camera_pose(2.0, 7.0)) == 0.0
-    frames = [hint.contradiction(camera_pose(1.0 + k / 30, 40.0)) > 0.0 for k in range(40)]
-    assert frames == [True] * 30 + [False] * 10
-
-
-@pytest.mark.parametrize('seconds', [-1.0, 11.0])
-def test_poses_at_other_times_are_not_compared(seconds):
-    assert RestartHint(LAST, np.eye(4)).contradiction(camera_pose(seconds, 900.0)) == 0.0
 
 
 def test_the_file_holds_it_for_ten_seconds(tmp_path):

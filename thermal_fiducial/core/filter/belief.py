@@ -2,15 +2,18 @@
 
 A pose that fails the gate of the estimate begins an alternative hypothesis, a second estimate. It replaces the first
 when many poses pass its gate while the estimate refuses them, so that the gate cannot lock the filter out. The filter
-is initialised in the same way, without an estimate to replace.
+is initialised in the same way, without an estimate to replace. Each pose gets a verdict, which is logged.
 """
 
+from dataclasses import dataclass
+from itertools import islice
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.state import Estimate, POSITION
-from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import SECOND_NS
 
@@ -22,10 +25,33 @@ REFUSALS_OF_DOUBT = 3
 #: Poses that the estimate must accept in a row for the alternative to be dropped.
 _REFUTED = 3
 NEVER = -(1 << 62)
+#: Verdicts kept, and poses over which the diagnostics average the normalised innovation squared (NIS).
+_KEPT, _NIS_POSES = 300, 30
 #: Reason of a reset. In fast motion poses are off together by a line readout or a lag that is not as declared.
 OUTVOTED = (
     'the poses contradict the estimate and agree with each other; if in fast motion: readout_time, bolometer_lag?'
 )
+
+
+@dataclass(frozen=True, slots=True)
+class PoseUpdate:
+    """Verdict on a camera pose."""
+
+    #: stamp of the camera, as it came
+    stamp_ns: int
+    #: whether it moved the estimate
+    accepted: bool
+    #: in words; empty when accepted, except for the pose that initialised or reset the filter
+    reason: str
+    #: squared Mahalanobis distance (6 degrees of freedom), NaN where there was nothing to compare with
+    nis: float
+    #: whether it waits for the IMU samples of its instant; the final word is in ``PoseEkf.decided``
+    pending: bool = False
+
+    @property
+    def refused(self) -> bool:
+        """Whether it was compared with the estimate and found beyond the gate."""
+        return not self.accepted and not math.isnan(self.nis)
 
 
 class Hypothesis(NamedTuple):
@@ -143,3 +169,27 @@ class Belief(NamedTuple):
             reset_reason=reason,
             contradiction=None,
         )
+
+
+class PoseLog:
+    """The latest verdicts, in the order in which they were given, and the numbers of accepted and refused poses."""
+
+    def __init__(self) -> None:
+        #: stamp of the camera to the latest verdict on its pose
+        self.latest: dict[int, PoseUpdate] = {}
+        self.accepted = self.refused = 0
+
+    def add(self, update: PoseUpdate) -> None:
+        """Log a verdict; a pose that is applied again after a late one counts once."""
+        if self.latest.pop(update.stamp_ns, None) is None:
+            self.accepted += update.accepted
+            self.refused += update.refused
+        self.latest[update.stamp_ns] = update
+        if len(self.latest) > _KEPT:
+            del self.latest[next(iter(self.latest))]
+
+    def mean_nis(self) -> float:
+        """Mean NIS per degree of freedom of the latest accepted poses: 1 is consistent, less conservative."""
+        latest = islice(reversed(self.latest.values()), _NIS_POSES)
+        values = [update.nis / 6.0 for update in latest if update.accepted and not math.isnan(update.nis)]
+        return float(np.mean(values or math.nan))

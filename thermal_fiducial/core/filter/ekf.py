@@ -6,17 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.belief import Hypothesis
+from thermal_fiducial.core.filter.belief import Hypothesis, PoseUpdate
 from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid, SMALLEST_STEP_NS
-from thermal_fiducial.core.filter.condition import condition_of, figures_of
 from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.hypotheses import is_of_unknown_clock, KNOWN_OFFSET_STD
 from thermal_fiducial.core.filter.imu_input import CLOCK_EVIDENCE, ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
-from thermal_fiducial.core.filter.output import in_corrected_map, odometry
+from thermal_fiducial.core.filter.output import condition_of, figures_of, in_corrected_map, odometry
 from thermal_fiducial.core.filter.propagation import usable_seconds
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
-from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, Condition, ImuSample, in_moved_map, Odometry

@@ -10,7 +10,7 @@ import math
 from operator import attrgetter
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.belief import Belief, Hypothesis
+from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.hypotheses import (
     alternative_to,
     contradiction,
@@ -23,7 +23,6 @@ from thermal_fiducial.core.filter.initialization import no_gravity, WINDOW_SECON
 from thermal_fiducial.core.filter.propagation import propagated, random_walks
 from thermal_fiducial.core.filter.state import Estimate
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
-from thermal_fiducial.core.filter.verdicts import PoseLog, PoseUpdate
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import SECOND_NS
 

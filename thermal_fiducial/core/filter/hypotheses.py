@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.belief import Hypothesis
+from thermal_fiducial.core.filter.belief import Hypothesis, PoseUpdate
 from thermal_fiducial.core.filter.initialization import blank_state, start
 from thermal_fiducial.core.filter.state import POSE, TIME_OFFSET
 from thermal_fiducial.core.filter.update import (
@@ -17,7 +17,6 @@ from thermal_fiducial.core.filter.update import (
     with_covariance,
     with_unknown_clock,
 )
-from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.measurements import CameraPose, Condition
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 

@@ -2,9 +2,11 @@
 
 That is enough: the pose error is linear in the error coordinates, so that the next two or three poses determine
 velocity and tilt whatever their true values are.
+
+A filter that restarts in flight has the last pose before as well: it rejects implausible first poses.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -27,9 +29,9 @@ from thermal_fiducial.core.filter.state import (
     SYSTEMATIC,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry.se3 import camera_in_body
-from thermal_fiducial.core.measurements import Condition
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.geometry.se3 import camera_in_body, inverse
+from thermal_fiducial.core.measurements import CameraPose, Condition
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Window [s] of the samples that a first pose is compared with.
 WINDOW_SECONDS = 0.5
@@ -38,6 +40,12 @@ WINDOW_SECONDS = 0.5
 HARDLY_GRAVITY = 0.5
 #: Largest angle [rad] between a first pose's vertical and the specific force: beyond it the planar branch is wrong.
 LARGEST_TILT = math.radians(35.0)
+#: Longest time [s] for which the last pose still limits where the robot can be.
+HINT_SECONDS = 10.0
+#: Largest distance of the robot from its last pose: a constant [m] and a speed [m/s].
+_NEAR, _SPEED = 0.5, 3.0
+#: Poses in a row that contradict the hint until it is dropped: a second at 30 Hz.
+_PROOF = 30
 
 
 def blank_state(config: PoseEkfConfig) -> NavigationState:
@@ -127,3 +135,42 @@ def _initial_variances(config: PoseEkfConfig) -> FloatArray:
     stds[GRAVITY] = config.gravity * config.map_tilt_std
     stds[EXTRINSICS] = np.repeat((config.extrinsics_orientation_std, config.extrinsics_position_std), 3)
     return np.square(stds)
+
+
+@dataclass(frozen=True)
+class LastPose:
+    """The last pose of a filter before it ended, and its clock offset."""
+
+    stamp_ns: int
+    #: (4, 4)
+    T_map_body: FloatArray
+    #: t_imu - t_camera [s]; None: not known
+    camera_time_offset: float | None
+
+
+class RestartHint:
+    """Keeps the wrong branch of a planar pose, or a duplicated marker, from initialising a restarted filter.
+
+    Parameters
+    ----------
+    last : state before the restart
+    T_body_camera : (4, 4)
+    """
+
+    def __init__(self, last: LastPose, T_body_camera: FloatArray) -> None:
+        self._last = last
+        self._T_camera_body = inverse(T_body_camera)
+        self._contradictions = 0
+
+    def contradiction(self, pose: CameraPose) -> float:
+        """Distance [m] of an implausibly far pose from the last one; 0 if the pose is plausible."""
+        seconds = (pose.stamp_ns - self._last.stamp_ns) / SECOND_NS
+        if not 0.0 <= seconds <= HINT_SECONDS or self._contradictions >= _PROOF:
+            return 0.0
+        position = (pose.T_map_camera @ self._T_camera_body)[:3, 3]
+        distance = float(np.linalg.norm(position - self._last.T_map_body[:3, 3]))
+        if distance <= _NEAR + _SPEED * seconds:
+            self._contradictions = 0
+            return 0.0
+        self._contradictions += 1
+        return distance

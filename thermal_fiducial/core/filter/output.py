@@ -1,17 +1,20 @@
-"""Published odometry: ROS conventions, of another frame on the robot if asked for, without steps if asked for."""
+"""What the filter gives: odometry in ROS conventions, of another frame or without steps if asked for; its condition."""
 
 from dataclasses import replace
 import math
 
 import numpy as np
 
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.belief import Belief, Hypothesis
+from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.imu_buffer import LastSample
 from thermal_fiducial.core.filter.state import CORE, Estimate, NavigationState, POSITION, PUBLISHED, ROTATION, VELOCITY
 from thermal_fiducial.core.filter.update import pose_error
 from thermal_fiducial.core.geometry.reprojection import lever_arm, turned, twist_transfer
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, transform
-from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.measurements import Condition, Odometry
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: (12, 12) Jacobian of position, rotation, velocity and rate of the robot by the core's errors and the gyroscope's
 #: bias, without the blocks that depend on attitude and velocity.
@@ -22,6 +25,10 @@ _AT_REST[9:, 9:] = -np.eye(3)
 _RATE_VARIANCES = slice(9 * 13, None, 13)
 #: A correction beyond this [m] is a new start of the filter: spreading it would only prolong the error.
 LARGEST_STEP = 1.0
+#: Conditions that a node compares with.
+TRACKING, WAITING = Condition('tracking'), Condition('waiting for markers')
+#: Time without an accepted pose after which the filter is said to coast [s].
+COASTING_S = 0.5
 
 
 def odometry(estimate: Estimate, other: Estimate | None, sample: LastSample) -> Odometry:
@@ -114,3 +121,50 @@ def _motion(before: Odometry, now: Odometry, dt: float) -> FloatArray:
     """T_before_now (4, 4) by the mean of both twists."""
     rotation = so3_exp(0.5 * dt * (before.angular_velocity_body + now.angular_velocity_body))
     return transform(rotation, 0.5 * dt * (before.velocity_body + rotation @ now.velocity_body))
+
+
+def coasting_seconds(history: History, main: Hypothesis) -> float:
+    """Time from the last accepted pose to the newest sample [s]."""
+    return (history.imu.newest_ns - main.accepted_ns) / SECOND_NS
+
+
+def condition_of(history: History, config: PoseEkfConfig) -> Condition:
+    """The condition of the filter."""
+    if not history.imu:
+        return Condition('waiting for IMU')
+    main = history.main
+    if main is None:
+        return _without_estimate(history.belief, config)
+    if main.estimate.position_std > config.lost_position_std:
+        return Condition('lost', f'position known to {main.estimate.position_std:.2f} m')
+    if main.in_doubt:
+        return Condition('in doubt', f'{main.refused_in_row} poses in a row contradict the estimate')
+    coasting = coasting_seconds(history, main)
+    return Condition('coasting', f'{coasting:.1f} s without a pose') if coasting > COASTING_S else TRACKING
+
+
+def _without_estimate(belief: Belief, config: PoseEkfConfig) -> Condition:
+    if belief.contradiction is not None:
+        return belief.contradiction
+    begun = belief.alternative
+    return Condition('initialising', f'{begun.hits} of {config.initial_poses} poses') if begun else WAITING
+
+
+def figures_of(history: History, main: Hypothesis, T_map_first: FloatArray, gravity: float) -> dict[str, float]:
+    """Figures of the estimate ``main`` for the diagnostics (SI units).
+
+    ``T_map_first`` (4, 4): the map that it is in, in the present one; ``gravity``: its size.
+    """
+    state, noise = main.estimate.state.in_moved_map(T_map_first), main.estimate.pose_noise
+    return {
+        'seconds since accepted pose': coasting_seconds(history, main),
+        'position std': main.estimate.position_std,
+        'white pose error': math.sqrt(noise.white.value),
+        'stamp jitter': math.sqrt(noise.jitter.value),
+        'mount vibration': math.sqrt(noise.vibration.value),
+        'gyroscope bias': float(np.linalg.norm(state.bias[:3])),
+        'accelerometer bias': float(np.linalg.norm(state.bias[3:])),
+        'gyroscope scale error': float(np.abs(state.scale[0]).max()),
+        'accelerometer scale error': float(np.abs(state.scale[1]).max()),
+        'map tilt': math.asin(float(np.hypot(*state.gravity[:2])) / gravity),
+    }

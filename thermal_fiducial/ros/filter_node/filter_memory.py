@@ -5,10 +5,10 @@ import math
 import os
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.belief import PoseUpdate
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.hypotheses import KNOWN_OFFSET_STD
-from thermal_fiducial.core.filter.restart import LastPose, RestartHint
-from thermal_fiducial.core.filter.verdicts import PoseUpdate
+from thermal_fiducial.core.filter.initialization import LastPose, RestartHint
 from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.files.last_pose import recent_pose, save_last_pose

@@ -1,8 +1,8 @@
 """Status of the filter: diagnostics, console lines, count of jumps of the pose."""
 
-from thermal_fiducial.core.filter.condition import TRACKING, WAITING
+from thermal_fiducial.core.filter.belief import PoseUpdate
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.filter.verdicts import PoseUpdate
+from thermal_fiducial.core.filter.output import TRACKING, WAITING
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.files.innovations import INNOVATIONS, innovations_text, LAST_REFUSED

@@ -5,14 +5,14 @@ import pytest
 from support.flights import config, Flight, Motion
 
 from thermal_fiducial.core.filter.belief import REFUSALS_OF_DOUBT
-from thermal_fiducial.core.filter.condition import (
+from thermal_fiducial.core.filter.history import History
+from thermal_fiducial.core.filter.output import (
     COASTING_S,
     coasting_seconds,
     condition_of,
     TRACKING,
     WAITING,
 )
-from thermal_fiducial.core.filter.history import History
 
 CONFIG = config(initial_poses=3)
 RATE = 200
