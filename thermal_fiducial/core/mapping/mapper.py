@@ -50,8 +50,9 @@ class MarkerMapper:
 
     def __init__(self, config: MarkerMapperConfig, marker_map: MarkerMap) -> None:
         self.configure(config)
-        #: while True the map does not change; ``config.mode`` gives the initial value
+        #: while True the map does not change but for its quarantine; ``config.mode`` gives the initial value
         self.frozen = config.mode == 'localization'
+        self._owns_map = True
         self.resets = 0
         self._begin(marker_map)
 
@@ -85,6 +86,11 @@ class MarkerMapper:
         #: the last pose that nothing contradicted
         self._last: CameraPose | None = None
         self._keyframes = KeyframeStore(self.config.keyframe_budget, self._initial)
+
+    def use_map_of(self, owner: 'MarkerMapper') -> None:
+        """Locate in the map of ``owner`` as it is now, and change nothing in it, quarantine included."""
+        self.map = owner.map
+        self.frozen, self._owns_map = True, False
 
     def process(
         self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None
@@ -158,7 +164,8 @@ class MarkerMapper:
             # Step 7: errors updated.
             self._bias.add(outcome)
             known, (errors, error_stds) = frame.known.markers, frame.known_errors(outcome)
-            changed = self._consistency.judge(self.map.markers, known, errors, error_stds, frame.left_out(outcome))
+            if self._owns_map:
+                changed = self._consistency.judge(self.map.markers, known, errors, error_stds, frame.left_out(outcome))
             # Step 8: new markers placed relative to the camera.
             if not self.frozen:
                 for marker, error in zip(known, errors.tolist(), strict=True):

@@ -23,8 +23,8 @@ from thermal_fiducial.ros.messages.message_bytes import PoseBytes
 class CameraPoses:
     """Publishes ``camera_pose``, and separately the part of its covariance that is due to the map's error.
 
-    A second camera (parameter ``second_camera``) is located in the map of ``mapper`` but never changes it: new
-    markers enter the map through the first camera only.
+    A second camera (parameter ``second_camera``) is located in the map of ``mapper`` but never changes it: markers
+    enter the map, and go into quarantine, by what the first camera sees.
     """
 
     def __init__(self, node: CameraStageNode[MarkerMapperConfig], mapper: MarkerMapper) -> None:
@@ -34,23 +34,24 @@ class CameraPoses:
         self._output = node.advertise(PoseWithCovarianceStamped, 'camera_pose')
         self._map_error = node.advertise(PoseWithCovarianceStamped, 'camera_pose/map_error')
         self._bytes = PoseBytes(node.config.map_frame)
+        self._config = node.config
         self._camera: Camera | None = None
         self._second: SecondCamera | None = None
+        self._locator: MarkerMapper | None = None
         name = node.config.second_camera
-        self._locator = MarkerMapper(_of_second(node.config), mapper.map)
         if name:
-            self.configure()
+            self._second = _second_of(node.config)
+            self._locator = MarkerMapper(_alone(node.config), mapper.map)
             node.subscribe_newest(PointCloud2, f'{name}/markers', self._on_second, qos.RESULT, raw=True)
             node.subscribe(CameraInfo, f'{name}/thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
 
     def configure(self) -> None:
-        """Update the extrinsics of both cameras."""
-        config = self._node.config
-        self._locator.configure(_of_second(config))
-        if config.second_camera:
-            first = camera_in_body(config)
-            second = camera_in_body(_of_second(config))
-            self._second = SecondCamera(first, second, config.time_offset_std)
+        """Apply dynamic parameters; only a camera that has moved on the robot makes the clocks' difference unknown."""
+        before, self._config = self._config, self._node.config
+        if self._locator is not None:
+            self._locator.configure(_alone(self._config))
+            if _places(self._config) != _places(before):
+                self._second = _second_of(self._config)
 
     def send(self, stamp_ns: int, pose: CameraPose | None) -> None:
         """Publish the pose of a frame of the first camera, if it has one, in the map as of its stamp."""
@@ -70,13 +71,14 @@ class CameraPoses:
 
     def _on_second(self, message: bytes) -> None:
         if self._camera is None:
-            raise InputError(f'no camera_info of {self._node.config.second_camera}')
-        self._locator.map = self._mapper.map
+            raise InputError(f'no camera_info of {self._config.second_camera}')
+        if self._second is None or self._locator is None:
+            return
+        self._locator.use_map_of(self._mapper)
         result = self._locator.process(*clouds.stamped_markers(message), self._camera, self._node.odometry)
-        if result.pose is not None and self._second is not None:
-            alone = self._second.add_second(result.pose, self._node.odometry)
-            if alone is not None:
-                self._publish(alone)
+        alone = None if result.pose is None else self._second.add_second(result.pose, self._node.odometry)
+        if alone is not None:
+            self._publish(alone)
 
     def figures(self) -> dict[str, object]:
         """Counters of the second camera's poses, and the difference of the clocks."""
@@ -88,7 +90,18 @@ class CameraPoses:
         return {f'second camera: {word}': figure for word, figure in (words | {'clock [ms]': clock}).items()}
 
 
-def _of_second(config: MarkerMapperConfig) -> MarkerMapperConfig:
+def _places(config: MarkerMapperConfig) -> tuple[tuple[float, ...], ...]:
+    """Position and orientation of both cameras on the robot."""
+    second = config.second_camera_position, config.second_camera_orientation
+    return config.camera_position, config.camera_orientation, *second
+
+
+def _second_of(config: MarkerMapperConfig) -> SecondCamera:
+    first, second = camera_in_body(config), camera_in_body(_alone(config))
+    return SecondCamera(first, second, config.time_offset_std)
+
+
+def _alone(config: MarkerMapperConfig) -> MarkerMapperConfig:
     """Parameters of the mapper that localizes the second camera in a frozen map."""
     return replace(
         config,

@@ -3,11 +3,13 @@
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
 from support import small_bag
 from support.messages import frames, info
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.detection.detector import MarkerDetector, rows_from_corners
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.second_camera import intersection, SecondCamera, seen_from
 from thermal_fiducial.core.measurements import CameraPose, Odometry
@@ -197,6 +199,50 @@ def test_parameters_in_the_second_cameras_namespace_are_its_own(tmp_path):
         '/down/**: {ros__parameters: {camera_position: [0.0, 0.0, -0.1]}}\n'
     )
     assert read_settings(path, {}).aruco_detector.camera_position == (0.1, 0.0, 0.0)
+
+
+def corners_in_view(stamp_ns, moved):
+    """The message of a frame that shows the markers of the small bag; marker 3 is 5 cm away if ``moved``."""
+    ids = np.arange(4)
+    T_map_marker = np.stack([marker.T_map_marker for marker in small_bag.map_of(range(4)).markers.values()])
+    T_map_marker[3, 1, 3] += 0.05 * moved
+    sizes, covariances = np.full(4, small_bag.SIZE), np.broadcast_to(1e-3 * np.eye(2), (4, 4, 2, 2))
+    T_map_camera = np.broadcast_to(T_BODY_FIRST, (4, 4, 4))
+    pixels = reproject(small_bag.CAMERA, T_map_camera, corners_in_map(T_map_marker, sizes))
+    rows = rows_from_corners(ids, pixels, covariances, sizes, small_bag.CAMERA)
+    return clouds.cloud(rows, convert.header(stamp_ns, 'camera'))
+
+
+@pytest.fixture
+def mapper_of_two(graph, tmp_path):
+    """The node with the map of the small bag and a second camera at the place of the first; both are calibrated."""
+    whole = small_bag.side_files(tmp_path, ids=(0, 1, 2, 3))[0]
+    place = {f'{name}camera_position': list(T_BODY_FIRST[:3, 3]) for name in ('', 'second_')}
+    node = graph.add(MarkerMapperNode, map_file=str(whole), second_camera='down', **place)
+    for topic in ('thermal/camera_info', 'down/thermal/camera_info'):
+        graph.send(topic, info())
+    return node
+
+
+@pytest.mark.ros
+def test_what_the_second_camera_sees_changes_nothing_in_the_map(graph, mapper_of_two):
+    """A marker that it sees elsewhere, for twice as many frames as put it into quarantine of the first camera."""
+    before = dict(mapper_of_two.mapper.map.markers)
+    for k in range(60):
+        graph.send('down/markers', corners_in_view(small_bag.START_NS + k * 33 * MS, moved=True))
+    assert mapper_of_two.mapper.map.markers == before
+    for k in range(60, 120):
+        graph.send('markers', corners_in_view(small_bag.START_NS + k * 33 * MS, moved=True))
+    assert not mapper_of_two.mapper.map.markers[3].trusted
+
+
+@pytest.mark.ros
+def test_a_dynamic_parameter_leaves_the_second_camera_as_it_is(graph, mapper_of_two):
+    for topic in ('markers', 'down/markers', 'markers'):
+        graph.send(topic, corners_in_view(small_bag.START_NS, moved=False))
+    assert graph.diagnose(mapper_of_two)[2]['second camera: joined'] == '1'
+    mapper_of_two.set_parameters([Parameter('refinement_period', value=5.0)])
+    assert graph.diagnose(mapper_of_two)[2]['second camera: joined'] == '1'
 
 
 @pytest.mark.ros
