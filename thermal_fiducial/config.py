@@ -245,6 +245,16 @@ def _camera_position(camera: str = 'the camera', needs: tuple[str, ...] = ()) ->
     )
 
 
+def _clock_random_walk(needs: tuple[str, ...]) -> Any:
+    return param(
+        5.0e-5,
+        "Random walk of the camera's clock, against the IMU's and a second camera's.",
+        unit='s/sqrt(s)',
+        minimum=0.0,
+        needs=needs,
+    )
+
+
 def _camera_orientation(frame: str = 'thermal_camera_optical', needs: tuple[str, ...] = ()) -> Any:
     return param(
         (-0.5, 0.5, -0.5, 0.5),
@@ -547,6 +557,8 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
     second_camera_orientation: tuple[float, ...] = _camera_orientation(
         "the second camera's optical frame", ('second_camera',)
     )
+    # Without a second camera it still concerns the filter, and may stand in the file of parameters of all nodes.
+    time_offset_random_walk: float = _clock_random_walk(())
     cloud_file: str = param('', 'Point cloud of the site (.ply or .pcd) to publish for RViz. Empty: none.', path=True)
     cloud_alignment_file: str = param(
         '',
@@ -642,13 +654,7 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
     """The filter."""
 
     estimate_time_offset: bool = param(True, 'Estimate the error of camera_time_offset.')
-    time_offset_random_walk: float = param(
-        5.0e-5,
-        'Random walk of the clock offset.',
-        unit='s/sqrt(s)',
-        minimum=0.0,
-        needs=('estimate_time_offset',),
-    )
+    time_offset_random_walk: float = _clock_random_walk(('estimate_time_offset',))
     stamp_jitter: float = param(
         0.0005,
         'Initial standard deviation of the jitter of the camera stamps, estimated from the poses. 0: no jitter.',

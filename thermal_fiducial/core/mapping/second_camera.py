@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.error_model import CHI2_OF_POSE, of_correlated_odometry, of_single_error
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract, turned
 from thermal_fiducial.core.geometry.se3 import inverse
@@ -22,9 +21,6 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 _CARRIED_NS = 70_000_000
 #: The second camera stands in when the first has had no pose for this long [ns].
 _ALONE_NS = 120_000_000
-
-#: Random walk of the difference [s/sqrt(s)]: that of a camera's clock against the IMU's.
-RANDOM_WALK = PoseEkfConfig.time_offset_random_walk
 #: Factor on its variance by poses that contradict each other: a clock may have stepped.
 _DOUBT = 2.0
 
@@ -35,10 +31,11 @@ class SecondClock:
     Parameters
     ----------
     std : standard deviation of the difference before any pose [s]; 0: the clocks are one
+    random_walk : of the difference [s/sqrt(s)]: that of a camera's clock against the IMU's
     """
 
-    def __init__(self, std: float) -> None:
-        self.seconds = 0.0
+    def __init__(self, std: float, random_walk: float) -> None:
+        self.seconds, self._random_walk = 0.0, random_walk
         self.variance = self._prior = std**2
         self._stamp_ns: int | None = None
 
@@ -61,7 +58,7 @@ class SecondClock:
         covariance : (6, 6) of ``apart`` by both poses; their errors last as long as the view
         """
         if self._stamp_ns is not None:
-            walked = RANDOM_WALK**2 * abs(stamp_ns - self._stamp_ns) / SECOND_NS
+            walked = self._random_walk**2 * abs(stamp_ns - self._stamp_ns) / SECOND_NS
             self.variance = min(self.variance + walked, self._prior)
         self._stamp_ns = stamp_ns
         weighted = np.linalg.solve(of_correlated_odometry(covariance), velocity)
@@ -81,15 +78,21 @@ class SecondCamera:
     Parameters
     ----------
     T_body_first, T_body_second : (4, 4) the cameras on the robot
-    time_offset_std : standard deviation of the difference of their clocks [s]
+    time_offset_std, time_offset_random_walk : of the difference of their clocks, see :class:`SecondClock`
     """
 
-    def __init__(self, T_body_first: FloatArray, T_body_second: FloatArray, time_offset_std: float = 0.0) -> None:
+    def __init__(
+        self,
+        T_body_first: FloatArray,
+        T_body_second: FloatArray,
+        time_offset_std: float = 0.0,
+        time_offset_random_walk: float = 0.0,
+    ) -> None:
         self._T_body_first = T_body_first
         self._T_second_first = inverse(T_body_second) @ T_body_first
         self._waiting: CameraPose | None = None
         self._first_ns: int | None = None
-        self.clock = SecondClock(time_offset_std)
+        self.clock = SecondClock(time_offset_std, time_offset_random_walk)
         #: number of fused frames, of the second's poses published alone, and of those that contradicted the first
         self.joined = self.alone = self.contradicted = 0
 

@@ -98,7 +98,7 @@ def _places(config: MarkerMapperConfig) -> tuple[tuple[float, ...], ...]:
 
 def _second_of(config: MarkerMapperConfig) -> SecondCamera:
     first, second = camera_in_body(config), camera_in_body(_alone(config))
-    return SecondCamera(first, second, config.time_offset_std)
+    return SecondCamera(first, second, config.time_offset_std, config.time_offset_random_walk)
 
 
 def _alone(config: MarkerMapperConfig) -> MarkerMapperConfig:

@@ -11,7 +11,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector, rows_from_corners
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
-from thermal_fiducial.core.mapping.second_camera import intersection, SecondCamera, seen_from
+from thermal_fiducial.core.mapping.second_camera import intersection, SecondCamera, SecondClock, seen_from
 from thermal_fiducial.core.measurements import CameraPose, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -199,6 +199,15 @@ def test_parameters_in_the_second_cameras_namespace_are_its_own(tmp_path):
         '/down/**: {ros__parameters: {camera_position: [0.0, 0.0, -0.1]}}\n'
     )
     assert read_settings(path, {}).aruco_detector.camera_position == (0.1, 0.0, 0.0)
+
+
+def test_the_clock_drifts_as_the_parameter_says():
+    clock, still, moving = SecondClock(0.03, random_walk=1e-3), np.zeros(6), np.ones(6)
+    clock.add(0, np.zeros(6), moving, 1e-6 * np.eye(6))
+    known = clock.variance
+    # A camera at rest says nothing about the clock. Four seconds of (1 ms)^2/s; exact but for rounding.
+    clock.add(4_000_000_000, np.zeros(6), still, np.eye(6))
+    assert clock.variance == pytest.approx(known + 4e-6)
 
 
 def corners_in_view(stamp_ns, moved):
