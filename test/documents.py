@@ -121,8 +121,8 @@ def parameter_table(config: type) -> str:
     for name, item, default in parameters(config):
         limits = item.metadata
         extra = f' One of: {", ".join(limits["choices"])}.' if limits['choices'] else ''
-        live = ' Live.' if limits['live'] else ''
-        rows.append(f'| `{name}` | `{json.dumps(default)}` | {limits["description"]}{extra}{live} |')
+        dynamic = ' Dynamic.' if limits['dynamic'] else ''
+        rows.append(f'| `{name}` | `{json.dumps(default)}` | {limits["description"]}{extra}{dynamic} |')
     return '\n'.join(rows)
 
 

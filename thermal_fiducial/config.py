@@ -36,7 +36,7 @@ def param(
     normed: bool = False,
     verify: Callable[[Any], object] | None = None,
     path: bool = False,
-    live: bool = False,
+    dynamic: bool = False,
     needs: tuple[str, ...] = (),
 ) -> Any:
     """One parameter: a dataclass field whose metadata fill ROS's parameter descriptor.
@@ -52,7 +52,7 @@ def param(
     normed : whether the tuple must have unit norm (a quaternion)
     verify : called with the value; raises InputError if it is unusable
     path : whether the string may be a path, in which a leading ~ is the user's home: no shell replaces it there
-    live : whether the parameter is dynamic; otherwise it is declared read-only
+    dynamic : whether it may be set while the node runs; otherwise it is declared read-only
     needs : parameters of the same node without which this one has no effect; "a or b": one of the two
     """
     if needs:
@@ -66,7 +66,7 @@ def param(
         'normed': normed,
         'verify': verify,
         'path': path,
-        'live': live,
+        'dynamic': dynamic,
         'needs': needs,
     }
     return field(default=default, metadata=metadata)
@@ -371,7 +371,7 @@ class Tau2CameraConfig(ImageRateParameters, FrameParameters, ImageParameters):
         choices=('raw', 'compressed'),
     )
     bad_pixel_file: str = param('', 'List of dead pixels: a text file, "column row" a line. Empty: none.', path=True)
-    find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.', live=True)
+    find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.', dynamic=True)
     bits: int = param(
         14,
         'Significant bits of a 16-bit pixel; flag bits above them are masked unless counts carry into them, '
@@ -384,7 +384,7 @@ class Tau2CameraConfig(ImageRateParameters, FrameParameters, ImageParameters):
         'Frames dropped after a shutter event, since they may still contain counts from before it.',
         minimum=0,
         maximum=30,
-        live=True,
+        dynamic=True,
     )
     view_tail_percent: float = param(
         0.5,
@@ -392,21 +392,21 @@ class Tau2CameraConfig(ImageRateParameters, FrameParameters, ImageParameters):
         unit='%',
         minimum=0.0,
         maximum=25.0,
-        live=True,
+        dynamic=True,
     )
     view_smoothing: float = param(
         0.05,
         '8-bit view: weight of a new frame in the exponential average of the scale.',
         minimum=0.001,
         maximum=1.0,
-        live=True,
+        dynamic=True,
     )
     view_minimum_span: float = param(
         40.0,
         '8-bit view: smallest range of the scale, so that noise alone does not fill it.',
         unit='counts',
         minimum=1.0,
-        live=True,
+        dynamic=True,
     )
 
 
@@ -442,7 +442,7 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
         'auto',
         "Corner refinement. auto, edges: intersections of fitted side lines; subpix: OpenCV's cornerSubPix.",
         choices=('auto', 'edges', 'subpix'),
-        live=True,
+        dynamic=True,
     )
     whitelist: tuple[int, ...] = param((), 'IDs that may be found. Empty: all of the dictionary.')
     whitelist_from_map: bool = param(False, 'Find only the markers of the map, where there is one.')
@@ -451,61 +451,61 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
         'Polarity that a blind search accepts: dark (colder than the background), bright, any, or alike: the polarity '
         'of the markers seen in the last seconds.',
         choices=('alike', 'any', 'dark', 'bright'),
-        live=True,
+        dynamic=True,
     )
-    min_side_px: float = param(12.0, 'Shortest side of a marker.', unit='px', minimum=8.0, maximum=400.0, live=True)
+    min_side_px: float = param(12.0, 'Shortest side of a marker.', unit='px', minimum=8.0, maximum=400.0, dynamic=True)
     min_contrast: float = param(
         0.7,
         'Smallest contrast-to-noise ratio: white minus black over the noise standard deviation of a pixel.',
         minimum=0.0,
         maximum=1000.0,
-        live=True,
+        dynamic=True,
     )
     min_correlation: float = param(
-        0.65, 'Smallest correlation of the cells with the bit pattern.', minimum=0.5, maximum=1.0, live=True
+        0.65, 'Smallest correlation of the cells with the bit pattern.', minimum=0.5, maximum=1.0, dynamic=True
     )
     min_margin: float = param(
         0.07,
         'Smallest lead of the correlation over that of every other marker.',
         minimum=0.0,
         maximum=0.5,
-        live=True,
+        dynamic=True,
     )
     min_surround: float = param(
         0.3,
         'Smallest step from the border to its white surroundings, as a share of the contrast, on three sides.',
         minimum=0.0,
         maximum=1.0,
-        live=True,
+        dynamic=True,
     )
     max_bit_errors: int = param(
         -1,
         'Most bits on the wrong side of the threshold between black and white. -1: as many as the dictionary corrects.',
         minimum=-1,
         maximum=20,
-        live=True,
+        dynamic=True,
     )
     max_border_errors: int = param(
-        2, 'Most cells of the black border on the wrong side.', minimum=0, maximum=20, live=True
+        2, 'Most cells of the black border on the wrong side.', minimum=0, maximum=20, dynamic=True
     )
-    guided: bool = param(True, 'Search for mapped markers where map and odometry predict them.', live=True)
+    guided: bool = param(True, 'Search for mapped markers where map and odometry predict them.', dynamic=True)
     blind_interval: int = param(
         10,
         'Frames between blind searches; fewer without a map or when most of the expected markers are not seen. When '
         'all are seen, the searches alternate between full resolution (small markers) and half (faint ones).',
         minimum=1,
         maximum=1000,
-        live=True,
+        dynamic=True,
     )
     max_odometry_age: float = param(
-        0.1, 'Largest age of the odometry for a guided search.', unit='s', minimum=0.0, maximum=1.0, live=True
+        0.1, 'Largest age of the odometry for a guided search.', unit='s', minimum=0.0, maximum=1.0, dynamic=True
     )
     guided_min_contrast: float = param(
         0.35,
         'min_contrast of an expected marker.',
         minimum=0.0,
         maximum=1000.0,
-        live=True,
+        dynamic=True,
         needs=('guided',),
     )
     guided_min_correlation: float = param(
@@ -513,11 +513,11 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
         'min_correlation of an expected marker.',
         minimum=0.3,
         maximum=1.0,
-        live=True,
+        dynamic=True,
         needs=('guided',),
     )
     guided_min_margin: float = param(
-        0.05, 'min_margin of an expected marker.', minimum=0.0, maximum=0.5, live=True, needs=('guided',)
+        0.05, 'min_margin of an expected marker.', minimum=0.0, maximum=0.5, dynamic=True, needs=('guided',)
     )
     detections: str = param(
         '',
@@ -533,7 +533,7 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
         'drop',
         'An ID seen twice in a frame (a reflection, say). drop: discard both; best: keep the better correlated one.',
         choices=('drop', 'best'),
-        live=True,
+        dynamic=True,
     )
 
 
@@ -572,14 +572,14 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
         'poses.',
         minimum=0.0,
         maximum=0.1,
-        live=True,
+        dynamic=True,
     )
     focal_length_std: float = param(
         0.002,
         'Error of the calibrated focal length (relative standard deviation); enters the covariances of poses.',
         minimum=0.0,
         maximum=0.1,
-        live=True,
+        dynamic=True,
     )
     bridge_duration: float = param(
         3.0,
@@ -587,7 +587,7 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
         unit='s',
         minimum=0.0,
         maximum=60.0,
-        live=True,
+        dynamic=True,
     )
     keyframe_budget: int = param(800, 'Most keyframes of the bundle adjustment.', minimum=10, maximum=20000)
     autosave_period: float = param(
@@ -599,7 +599,12 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
         needs=('map_file',),
     )
     refinement_period: float = param(
-        2.0, 'Shortest time between two bundle adjustments; 0: none.', unit='s', minimum=0.0, maximum=3600.0, live=True
+        2.0,
+        'Shortest time between two bundle adjustments; 0: none.',
+        unit='s',
+        minimum=0.0,
+        maximum=3600.0,
+        dynamic=True,
     )
 
 
@@ -704,7 +709,7 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         1.0,
         'Factor on the standard deviation of the camera poses; larger scatter is estimated on top of it.',
         minimum=0.1,
-        live=True,
+        dynamic=True,
     )
     systematic_pose_std: float = param(
         1.0,
@@ -719,7 +724,7 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         22.5,
         'Gate: a pose with a larger NIS is refused (22.5: 99.9 % quantile of chi-square, 6 degrees of freedom).',
         minimum=1.0,
-        live=True,
+        dynamic=True,
     )
     reset_after: float = param(
         1.0,
@@ -727,7 +732,7 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         'estimate, as many are needed as the estimate has accepted (at most 300), unless it is lost.',
         unit='s',
         minimum=0.0,
-        live=True,
+        dynamic=True,
     )
     max_delay: float = param(
         1.0, 'Largest delay of a pose; later ones are refused.', unit='s', minimum=0.0, maximum=10.0
@@ -738,10 +743,10 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         'The pose is lost when the standard deviation of the position exceeds this.',
         unit='m',
         minimum=0.001,
-        live=True,
+        dynamic=True,
     )
     reinitialise_after: float = param(
-        60.0, 'Reset after this time without an accepted pose.', unit='s', minimum=1.0, live=True
+        60.0, 'Reset after this time without an accepted pose.', unit='s', minimum=1.0, dynamic=True
     )
     smoothing_time: float = param(
         0.0, 'Time over which the smooth output spreads corrections; 0: no smooth output.', unit='s', minimum=0.0

@@ -59,8 +59,8 @@ def _limits(limits: Any) -> Iterator[str]:
         yield f'At least {low:g}.'
     elif high is not None:
         yield f'At most {high:g}.'
-    if limits['live']:
-        yield 'Live.'
+    if limits['dynamic']:
+        yield 'Dynamic.'
 
 
 if __name__ == '__main__':

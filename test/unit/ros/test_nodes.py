@@ -209,8 +209,8 @@ def test_an_image_of_another_size_than_the_calibration_is_refused(graph):
 
 def test_parameters_that_do_nothing_are_warned_of_while_the_detector_works(graph):
     node = graph.add(ArucoDetector, whitelist=[3, 77])
-    live = [Parameter('guided', value=False), Parameter('guided_min_margin', value=0.1)]
-    assert all(result.successful for result in node.set_parameters(live))
+    dynamic = [Parameter('guided', value=False), Parameter('guided_min_margin', value=0.1)]
+    assert all(result.successful for result in node.set_parameters(dynamic))
     graph.send('thermal/camera_info', info())
     graph.send('thermal/image', frames(1)[0])
     assert graph.diagnose(node)[:2] == (

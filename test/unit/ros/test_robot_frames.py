@@ -97,12 +97,12 @@ def test_a_robot_description_decides_where_the_camera_is(graph, kind, capfd):
     assert len(lines) == 1
     assert 'from robot_description, 0.201 m and 0.00 deg from the previous pose' in lines[0]
     # A parameter that is set while it runs brings nothing of the others back.
-    live = [
+    dynamic = [
         parameter
         for name, parameter in node.get_parameters_by_prefix('').items()
         if hasattr(node.config, name) and not node.describe_parameter(name).read_only
     ]
-    assert all(result.successful for result in node.set_parameters(live[:1]))
+    assert all(result.successful for result in node.set_parameters(dynamic[:1]))
     np.testing.assert_allclose(in_force(node), FORWARD, atol=1e-12)
 
 
@@ -138,8 +138,8 @@ def test_a_robot_that_is_too_large_is_refused_and_another_one_taken(graph, joint
     assert node.config.camera_position == (0.0, 0.0, 0.0)
     graph.send('robot_description', String(data=URDF), profile=qos.LATCHED)
     np.testing.assert_allclose(in_force(node), transform(np.eye(3), [0.0, 0.0, -0.05]) @ FORWARD, atol=1e-12)
-    live = node.set_parameters([Parameter('gate', value=20.0)])
-    assert all(result.successful for result in live)
+    dynamic = node.set_parameters([Parameter('gate', value=20.0)])
+    assert all(result.successful for result in dynamic)
 
 
 @pytest.mark.ros

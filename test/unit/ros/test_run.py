@@ -26,17 +26,17 @@ pytestmark = pytest.mark.ros
 
 @dataclass(frozen=True)
 class Inner:
-    gain: float = param(1.0, 'Gain.', unit='1/s', minimum=0.0, maximum=5.0, live=True)
+    gain: float = param(1.0, 'Gain.', unit='1/s', minimum=0.0, maximum=5.0, dynamic=True)
 
 
 @dataclass(frozen=True)
 class Parameters:
     """One of every kind."""
 
-    name: str = param('a', 'Name.', choices=('a', 'b'), live=True)
+    name: str = param('a', 'Name.', choices=('a', 'b'), dynamic=True)
     count: int = param(3, 'Count.', minimum=1)
     sizes: tuple[str, ...] = param((), 'Sizes.')
-    weights: tuple[float, ...] = param((), 'Weights.', live=True)
+    weights: tuple[float, ...] = param((), 'Weights.', dynamic=True)
     inner: Inner = group(Inner)  # noqa: RUF009
 
 
@@ -107,7 +107,7 @@ def set_parameter(graph, name, value):
     return result.successful, result.reason
 
 
-def test_live_parameters_can_be_set_and_others_not():
+def test_dynamic_parameters_can_be_set_and_others_not():
     with ros_graph() as graph:
         node = graph.add(Stage)
         assert set_parameter(graph, 'inner.gain', 3.0) == (True, '')

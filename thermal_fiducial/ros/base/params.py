@@ -88,7 +88,7 @@ def _declare(node: Node, name: str, item: 'Field[Any]', default: Any) -> None:
 
 def _descriptor(item: 'Field[Any]') -> ParameterDescriptor:
     limits = item.metadata
-    descriptor = ParameterDescriptor(description=limits['description'], read_only=not limits['live'])
+    descriptor = ParameterDescriptor(description=limits['description'], read_only=not limits['dynamic'])
     if limits['choices']:
         descriptor.additional_constraints = 'one of: ' + ', '.join(limits['choices'])
     low, high = limits['minimum'], limits['maximum']
