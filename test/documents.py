@@ -120,7 +120,7 @@ def parameter_table(config: type) -> str:
     rows = ['| parameter | default | meaning |', '|---|---|---|']
     for name, item, default in parameters(config):
         limits = item.metadata
-        extra = f' One of: {", ".join(limits["choices"])}.' if limits['choices'] else ''
+        extra = f' One of: {", ".join(filter(None, limits["choices"]))}.' if limits['choices'] else ''
         dynamic = ' Dynamic.' if limits['dynamic'] else ''
         rows.append(f'| `{name}` | `{json.dumps(default)}` | {limits["description"]}{extra}{dynamic} |')
     return '\n'.join(rows)

@@ -265,6 +265,10 @@ def _camera_orientation(frame: str = 'thermal_camera_optical', needs: tuple[str,
     )
 
 
+def _calibration_file(if_empty: str) -> Any:
+    return param('', f'Camera calibration (camera_info YAML), published with each image. Empty: {if_empty}.', path=True)
+
+
 @dataclass(frozen=True)
 class MarkerParameters(SelfChecked):
     """What the markers are."""
@@ -292,9 +296,7 @@ class FrameParameters(SelfChecked):
 class ImageParameters(SelfChecked):
     """What is published with the images of a camera."""
 
-    calibration_file: str = param(
-        '', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.', path=True
-    )
+    calibration_file: str = _calibration_file('that of the driver, thermal/camera_info')
     frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
 
 
@@ -318,7 +320,7 @@ class MountParameters(SelfChecked):
 
 @dataclass(frozen=True)
 class ClockParameters(SelfChecked):
-    """The camera's clock against the IMU's."""
+    """The camera's clock against the IMU's, and how well it is known."""
 
     camera_time_offset: float = param(
         0.0, 'Clock offset of the camera, t_imu = t_camera + offset.', unit='s', minimum=-1.0, maximum=1.0
@@ -347,7 +349,7 @@ class ScheduleParameters(SelfChecked):
 
 @dataclass(frozen=True)
 class ImageRateParameters(ScheduleParameters):
-    """The same of a node that works once a frame."""
+    """How the operating system schedules a node that works once a frame, and how many frames there are."""
 
     image_rate: float = param(
         0.0,
@@ -627,7 +629,8 @@ class ImuNoise(SelfChecked):
     )
     accelerometer_scale_std: float = param(
         0.005,
-        'The same for scale and cross-axis errors of the accelerometer.',
+        'Prior standard deviation of the scale and cross-axis errors of the accelerometer, which are estimated: half '
+        'the tolerance of the data sheet. 0: none.',
         minimum=0.0,
         maximum=0.1,
     )
@@ -790,6 +793,8 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
 @dataclass(frozen=True)
 class ThermalSourceConfig(FrameParameters, ImageParameters):
     """A camera driver, for cameras without one of their own."""
+
+    calibration_file: str = _calibration_file('none')
 
     camera: str = param(
         '',

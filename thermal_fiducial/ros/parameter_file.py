@@ -51,7 +51,7 @@ def _entry(name: str, item: 'Field[Any]', default: Any) -> Iterator[str]:
 
 def _limits(limits: Any) -> Iterator[str]:
     if limits['choices']:
-        yield f'One of: {", ".join(limits["choices"])}.'
+        yield f'One of: {", ".join(filter(None, limits["choices"]))}.'
     low, high = limits['minimum'], limits['maximum']
     if low is not None and high is not None:
         yield f'From {low:g} to {high:g}.'

@@ -75,5 +75,5 @@ class ImuQueue:
         return '' if self.level() == OK else f'overloaded: IMU messages wait for {self._reported:.2g} s'
 
     def headline(self) -> str:
-        """The same without numbers."""
+        """The delay in words, without numbers; empty while poses come in time."""
         return '' if self.level() == OK else 'overloaded: poses are late'
