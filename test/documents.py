@@ -1,8 +1,8 @@
 """Writes the tables of the documents and the parameter file: ``python test/documents.py`` (``make tables``).
 
 A table stands between ``<!-- NAME -->`` and ``<!-- end -->``. Topics and services are those of running nodes with all
-optional outputs switched on, parameters come from ``config.py``, measured tables from the Markdown files that the
-benchmarks leave in ``doc/tables/``. What a topic is for stands in ``doc/interfaces.yaml``.
+optional outputs switched on, parameters come from ``config.py``, arguments from the launch files, measured tables from
+the Markdown files that the benchmarks leave in ``doc/tables/``. What a topic is for stands in ``doc/interfaces.yaml``.
 """
 
 from collections.abc import Iterator, Mapping
@@ -12,13 +12,16 @@ from itertools import groupby
 import json
 from pathlib import Path
 import re
+import runpy
 import sys
 import tempfile
 from typing import Any
 from unittest.mock import patch
 
+import pytest
 from rclpy.context import Context
 from rclpy.parameter import Parameter
+from support import launch_api
 from support.small_bag import CAMERA
 import yaml
 
@@ -29,7 +32,7 @@ from thermal_fiducial.ros.base.node import StageNode
 from thermal_fiducial.ros.parameter_file import parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = tuple(ROOT / 'doc' / f'{page}.md' for page in ('accuracy', 'faults', 'nodes'))
+PAGES = tuple(ROOT / 'doc' / f'{page}.md' for page in ('accuracy', 'faults', 'install', 'nodes'))
 INTERFACES = ROOT / 'doc' / 'interfaces.yaml'
 CALIBRATION = 'CALIBRATION'
 #: Packages whose topics ``interfaces.yaml`` has with their type: hidden, so that the pages are the same with them.
@@ -126,6 +129,29 @@ def parameter_table(config: type) -> str:
     return '\n'.join(rows)
 
 
+def launch_arguments(file: Path) -> dict[str, Any]:
+    """Name to declaration of the arguments of a launch file, which runs against stand-ins of ``launch``."""
+    with pytest.MonkeyPatch.context() as patched, launch_api.installed(patched, ROOT):
+        description = runpy.run_path(str(file))['generate_launch_description']()
+    declared = [item for item in description.entities if isinstance(item, launch_api.DeclareLaunchArgument)]
+    return {item.name: item for item in declared}
+
+
+def launch_table() -> str:
+    """Markdown table of the arguments that all launch files take, with the defaults of each."""
+    files = {file.name: launch_arguments(file) for file in sorted((ROOT / 'launch').glob('*.launch.py'))}
+    usual = files['localization.launch.py']
+    rows = ['| argument | default | meaning |', '|---|---|---|']
+    for name, argument in usual.items():
+        defaults: dict[str, list[str]] = {argument.default_value: []}
+        for file, declared in files.items():
+            defaults.setdefault(declared[name].default_value, []).append(f'`{file}`')
+        others = [f'`{value}` in {", ".join(of)}' for value, of in list(defaults.items())[1:]]
+        default = '; '.join([f'`{argument.default_value}`' if argument.default_value else '', *others])
+        rows.append(f'| `{name}` | {default} | {argument.description} |')
+    return '\n'.join(rows)
+
+
 def row_layout(dtype: Any) -> str:
     """The fields of a row with their types, one type after another."""
     kinds = {'<f4': 'float32', '<u4': 'uint32', '|u1': 'uint8'}
@@ -142,6 +168,7 @@ def tables() -> dict[str, str]:
         measured
         | {f'parameters {name}': parameter_table(config) for name, config in nodes.items()}
         | {f'topics {name}': interface_table(name) for name in nodes}
+        | {'launch arguments': launch_table()}
         | {'rows markers': row_layout(MARKER_DTYPE), 'rows marker_map': row_layout(MAP_DTYPE)}
     )
 

@@ -29,11 +29,11 @@ _ARGUMENTS = {
     'params_file': ('', 'parameter file of the rig; default: the one of the package'),
     'map_file': ('', 'marker map; default: what the parameter file says'),
     'camera': ('', 'start thermal_source with this camera: /dev/video0, teax, a folder; default: another driver runs'),
-    'second_camera': (
+    'second_camera': ('', 'name of a second camera, the namespace of its images and detector; default: none'),
+    'second_camera_device': (
         '',
-        'name of a second camera, the namespace of its images and detector; default: none',
+        'start thermal_source for the second camera with this device, as camera does; default: another driver runs',
     ),
-    'second_camera_device': ('', 'start thermal_source for it too, as camera does; default: another driver runs'),
     'landing_pad': ('', 'start landing_target with these markers as the pad: 7, or 7,8,9; default: none'),
     'image_topic': ('thermal/image_raw', 'raw images of the camera'),
     'camera_info_topic': ('thermal/camera_info', 'calibration of the camera'),

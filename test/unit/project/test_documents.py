@@ -48,6 +48,11 @@ def test_each_node_is_on_the_page(node):
     assert all(f'<!-- {table} {node} -->' in page for table in ('topics', 'parameters'))
 
 
+def test_the_arguments_of_the_launch_files_are_on_the_page():
+    page = (ROOT / 'doc' / 'install.md').read_text(encoding='utf-8')
+    assert f'<!-- launch arguments -->\n{documents.launch_table()}\n<!-- end -->' in page
+
+
 def test_the_page_of_examples_shows_each_script():
     page = (ROOT / 'doc' / 'examples.md').read_text()
     for script in (ROOT / 'doc' / 'examples').glob('*.py'):
