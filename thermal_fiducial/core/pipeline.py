@@ -1,7 +1,8 @@
-"""The four stages composed: the offline twin of the node graph.
+"""The four stages composed: the node graph offline, for one camera and a map that no service replaces.
 
 Tests, benchmarks and tools run it without ROS. What passes from stage to stage is what the topics carry, in their
-precision, so a lock-step replay through the nodes gives the same numbers.
+precision, so a lock-step replay through the nodes gives the same numbers. The nodes alone fuse a second camera
+(``ros/mapper_node/camera_poses.py``), and move the filter with a map that is loaded or reset (``map_correction``).
 """
 
 from collections.abc import Mapping, Sequence

@@ -29,6 +29,17 @@ def test_the_design_names_files_that_are_there():
     assert [name for name in sorted(named) if not any(file.endswith(f'/{name}') for file in files)] == []
 
 
+def test_the_drawing_of_the_data_flow_is_one():
+    drawings = [
+        block
+        for page in PAGES
+        for block in re.findall(r'^```\w*\n(.*?)^```$', page.read_text(encoding='utf-8'), re.DOTALL | re.MULTILINE)
+        if '──►' in block
+    ]
+    assert len(drawings) == 2, 'one in the README and one in the design'
+    assert len(set(drawings)) == 1
+
+
 @pytest.mark.ros
 def test_tables_are_up_to_date():
     # They are made anew by: make tables
