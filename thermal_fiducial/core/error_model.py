@@ -1,10 +1,12 @@
-"""Every systematic error that the covariances allow for: name, unit, source, and where it enters.
+"""Systematic errors of the map and of camera poses from markers: name, unit, source, and where each enters.
 
 White noise averages out over the corners of a frame and over frames; a systematic error is the same for many of them
-and does not. Each is a field of :class:`SystematicErrors`; a covariance is widened by the functions here and nowhere
-else. An error that a frame shares with the next ones enters the covariance of a pose after the fit (as a consider
-parameter; S. Schmidt, 1966), never the weights frame by frame: weights that change with the markers in view would make
-the pose jump by what the markers are wrong by.
+and does not. Each is a field of :class:`SystematicErrors`; covariances of the map and of these poses are widened by the
+functions here and nowhere else. Errors of single corners in a frame are in ``detection/corner_errors.py``, those that
+the filter adds to its own model in ``filter/pose_noise.py`` and ``filter/imu_noise.py``. An error that a frame shares
+with the next ones enters the covariance of a pose after the fit (as a consider parameter; S. Schmidt, 1966), never the
+weights frame by frame: weights that change with the markers in view would make the pose jump by what the markers are
+wrong by.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Systematic errors of corners: all that widens a corner's covariance beyond pixel noise.
+"""Errors of the detector in the corners of a frame: what widens them beyond the noise of pixels, fit and motion.
 
 Each error has its unit and source here, and enters where its name is used.
 """
