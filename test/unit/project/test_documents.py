@@ -1,6 +1,7 @@
 """The documents say what the code does, and stay short."""
 
 import argparse
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 import re
@@ -11,6 +12,7 @@ import pytest
 
 from thermal_fiducial.cli.main import COMMANDS, MODULES
 from thermal_fiducial.config import NODES, OPTIONAL_NODES
+from thermal_fiducial.files.map_format import MapDocument, MarkerEntry
 
 ROOT = Path(__file__).resolve().parents[3]
 README = ROOT / 'README.md'
@@ -62,6 +64,15 @@ def test_each_node_is_on_the_page(node):
 def test_the_arguments_of_the_launch_files_are_on_the_page():
     page = (ROOT / 'doc' / 'install.md').read_text(encoding='utf-8')
     assert f'<!-- launch arguments -->\n{documents.launch_table()}\n<!-- end -->' in page
+
+
+def test_the_fields_of_a_map_file_are_on_the_page():
+    page = (ROOT / 'doc' / 'maps.md').read_text(encoding='utf-8')
+    (section,) = re.findall(r'^## Fields of a map file$(.*?)^## ', page, re.DOTALL | re.MULTILINE)
+    described = re.findall(r'^\| `(\w+)` \|', section, re.MULTILINE)
+    assert sorted(described) == sorted(
+        ['format', 'version', *(field.name for kind in (MapDocument, MarkerEntry) for field in fields(kind))]
+    )
 
 
 def test_the_page_of_examples_shows_each_script():
