@@ -30,7 +30,14 @@ setup(
         (f'share/{PACKAGE}/config', files('config', '*')),
         (f'share/{PACKAGE}/launch', files('launch', '*.launch.py')),
     ],
-    install_requires=['numpy>=1.26', 'opencv-python-headless>=4.10', 'filterpy>=2.0.0', 'pyyaml', 'rosbags>=0.11'],
+    install_requires=[
+        'numpy>=1.26',
+        'scipy',
+        'opencv-python-headless>=4.10',
+        'filterpy>=2.0.0',
+        'pyyaml',
+        'rosbags>=0.11',
+    ],
     extras_require={
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-common-interfaces==5.3.6'],
         'cloud': ['small_gicp', 'plyfile', 'pypcd4', 'scipy', 'rich', 'matplotlib'],
