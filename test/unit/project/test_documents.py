@@ -17,6 +17,8 @@ from thermal_fiducial.files.map_format import MapDocument, MarkerEntry
 ROOT = Path(__file__).resolve().parents[3]
 README = ROOT / 'README.md'
 LINK = re.compile(r'\]\(([^)#\s]+)')
+#: A link to a heading, of the same page if it names no file.
+TO_HEADING = re.compile(r'\]\(((?!\w+:)[^)#\s]*)#([^)\s]+)\)')
 PAGES = [README, *sorted((ROOT / 'doc').rglob('*.md'))]
 
 
@@ -90,6 +92,19 @@ def test_the_readme_is_short():
 def test_links_lead_to_files(page):
     links = [link for link in LINK.findall(page.read_text(encoding='utf-8')) if '://' not in link]
     missing = [link for link in links if not (page.parent / link).exists()]
+    assert missing == []
+
+
+def anchors(page):
+    """Names of the headings of a page, as the site and GitHub make them."""
+    headings = re.findall(r'^#+ (.+)$', page.read_text(encoding='utf-8'), re.MULTILINE)
+    return {re.sub(r'\s+', '-', re.sub(r'[^\w\s-]', '', heading).strip().lower()) for heading in headings}
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_links_to_headings_lead_to_some(page):
+    links = TO_HEADING.findall(page.read_text(encoding='utf-8'))
+    missing = [f'{to}#{name}' for to, name in links if name not in anchors(page.parent / to if to else page)]
     assert missing == []
 
 
