@@ -1,6 +1,8 @@
 """Parameters: complete metadata, and refusal of what doesn't fit."""
 
+import ast
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import pytest
 
@@ -115,6 +117,22 @@ def test_markers_that_the_dictionary_lacks_are_named():
         'parameter marker_size_overrides: DICT_4X4_50 has no marker 50',
     ]
     assert config.unknown_markers(values, 1000) == ['parameter whitelist: DICT_4X4_50 has no marker -1']
+
+
+def test_no_constructor_keeps_a_dynamic_parameter():
+    # What it keeps would stay as it is when the parameter is set in flight.
+    dynamic = {name for kind in NODES for name, item, _ in parameters(kind) if item.metadata['dynamic']}
+    read, kept = set(), []
+    for file in Path(config.__file__).parent.rglob('*.py'):
+        for function in ast.walk(ast.parse(file.read_text(encoding='utf-8'))):
+            if not isinstance(function, ast.FunctionDef):
+                continue
+            for node in ast.walk(function):
+                if isinstance(node, ast.Attribute) and node.attr in dynamic and 'config' in ast.unparse(node.value):
+                    read.add(node.attr)
+                    kept += [f'{file.name}: {node.attr}'] if function.name in ('__init__', '__post_init__') else []
+    assert kept == []
+    assert read == dynamic
 
 
 def test_parameters_of_a_class_and_of_an_instance():
