@@ -12,6 +12,7 @@ import pytest
 
 from thermal_fiducial.cli.main import COMMANDS, MODULES
 from thermal_fiducial.config import NODES, OPTIONAL_NODES
+from thermal_fiducial.core.filter.state import SIZE
 from thermal_fiducial.files.map_format import MapDocument, MarkerEntry
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -31,6 +32,15 @@ def test_the_design_names_files_that_are_there():
         for path in (ROOT / folder).rglob('*.py')
     ]
     assert [name for name in sorted(named) if not any(file.endswith(f'/{name}') for file in files)] == []
+
+
+def test_the_design_names_functions_that_are_there():
+    text, _, _ = (ROOT / 'doc' / 'design.md').read_text(encoding='utf-8').partition('## Conventions')
+    named = set(re.findall(r'`(\w+)`', text))
+    assert len(named) > 80
+    code = '\n'.join(file.read_text(encoding='utf-8') for file in (ROOT / 'thermal_fiducial').rglob('*.py'))
+    words = set(re.findall(r'\w+', code)) | {file.stem for file in (ROOT / 'test').rglob('*.py')}
+    assert sorted(named - words) == []
 
 
 def test_the_drawing_of_the_data_flow_is_one():
@@ -75,6 +85,14 @@ def test_the_fields_of_a_map_file_are_on_the_page():
     assert sorted(described) == sorted(
         ['format', 'version', *(field.name for kind in (MapDocument, MarkerEntry) for field in fields(kind))]
     )
+
+
+def test_the_error_coordinates_of_the_filter_are_on_the_page():
+    page = (ROOT / 'doc' / 'nodes.md').read_text(encoding='utf-8')
+    (section,) = re.findall(r'^\| estimated \| coordinates \|.*?^$', page, re.DOTALL | re.MULTILINE)
+    counts = [int(count) for count in re.findall(r'^\| [^|]+ \| (\d+) \|', section, re.MULTILINE)]
+    assert sum(counts) == SIZE
+    assert f'{SIZE} error coordinates' in page
 
 
 def test_the_page_of_examples_shows_each_script():
