@@ -51,6 +51,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
     def configure(self, config: ArucoDetectorConfig) -> None:
         """Apply dynamic parameters."""
         super().configure(config)
+        self._dictionaries.configure(config)
         if self.detector is not None:
             self.detector.configure(config)
 

@@ -1,5 +1,7 @@
 """Whether the detector notices that the markers in view are of another dictionary than the parameter says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support import small_pictures
@@ -53,6 +55,17 @@ def test_plates_of_another_dictionary_are_named_with_both_dictionaries(hung, own
     assert doubt.startswith(f'dictionary is {own}, but the markers in view are ')
     assert words in doubt
     assert doubt.endswith('set the parameter dictionary')
+
+
+def test_limits_that_change_in_flight_count_here_too():
+    image, _ = counts('STENCIL_4X4_100', np.arange(12))
+    config = ArucoDetectorConfig()
+    watch = OtherDictionaries(config)
+    # Markers of 40 px are too small for it, whatever they are of.
+    watch.configure(replace(config, min_side_px=80.0))
+    for k in range(2 * LOOKS):
+        watch.look(k * SECOND_NS // 2, image, CAMERA, any_seen=False)
+    assert watch.doubt == ''
 
 
 def test_dictionaries_with_the_same_markers_are_all_named():

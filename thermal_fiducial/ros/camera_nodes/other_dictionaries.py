@@ -38,15 +38,19 @@ class OtherDictionaries:
 
     def __init__(self, config: ArucoDetectorConfig) -> None:
         self._own = config.dictionary
-        self._config = replace(
-            config, max_bit_errors=0, guided=False, polarity='any', whitelist=(), whitelist_from_map=False
-        )
+        self.configure(config)
         self._names = [name for name in _USUAL if name != self._own]
         self._turn = self._settled = self._hits = 0
         self._ids: set[int] = set()
         self._due_ns: int | None = None
         #: warning that names both dictionaries; empty without a doubt
         self.doubt = ''
+
+    def configure(self, config: ArucoDetectorConfig) -> None:
+        """Take over the detector's dynamic parameters, as far as they say what is visible."""
+        self._config = replace(
+            config, max_bit_errors=0, guided=False, polarity='any', whitelist=(), whitelist_from_map=False
+        )
 
     def settle(self) -> None:
         """Look no more: a filter that runs has poses by our markers, and a look would delay the next frame."""
