@@ -6,6 +6,7 @@ from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, fields
 import heapq
+from itertools import takewhile
 import multiprocessing
 from multiprocessing.connection import Connection
 import os
@@ -14,6 +15,7 @@ import shutil
 import signal
 import tempfile
 import threading
+import time
 from typing import Any
 
 import cv2
@@ -174,24 +176,37 @@ def _arrivals(record: ImuRecord, stamps: IntArray, scenario: Scenario) -> list[i
 
 #: The camera of a worker process, created once, since its tables of rays take a second.
 _worker_camera: list[ThermalCamera] = []
+#: In a worker process: whether nobody waits for its frames any more.
+_worker_ends = threading.Event()
+#: Interval at which a worker that is to end looks whether the parent still lives [s].
+_GLANCE_S = 0.1
 
 
 def _start_worker(flight: FlightPlan, lifeline: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process ends us
-    threading.Thread(target=_end_with, args=(lifeline,), daemon=True).start()
+    threading.Thread(target=_end_with, args=(lifeline, os.getppid()), daemon=True).start()
     cv2.setNumThreads(1)
     _worker_camera[:] = [ThermalCamera(flight)]
 
 
-def _end_with(lifeline: Connection) -> None:
-    """End this worker when the parent closes ``lifeline`` or has ended, be it by a second interrupt or by a kill."""
+def _end_with(lifeline: Connection, parent: int) -> None:
+    """Stop rendering when the parent closes ``lifeline``; end this worker once the parent has ended in any way.
+
+    Not before: the parent would wait for ever for the rest of a result that was being sent.
+    """
     with suppress(EOFError, OSError):
         lifeline.recv()
+    _worker_ends.set()
+    while os.getppid() == parent:
+        time.sleep(_GLANCE_S)
     os._exit(1)
 
 
 def _render_chunk(start: int, stop: int) -> list[SimFrame]:
-    return list(_worker_camera[0].frames(start, stop))
+    if _worker_ends.is_set():
+        return []
+    frames = _worker_camera[0].frames(start, stop)
+    return list(takewhile(lambda _: not _worker_ends.is_set(), frames))
 
 
 def _frames(flight: FlightPlan, workers: int) -> Generator[SimFrame, None, None]:
@@ -203,7 +218,7 @@ def _frames(flight: FlightPlan, workers: int) -> Generator[SimFrame, None, None]
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')  # a worker is to use one core
     context = multiprocessing.get_context('spawn')  # a fork of a process that runs ROS deadlocks
     lifeline, theirs = context.Pipe()
-    # Left in the reverse order: the workers have ended before the pool waits for them, also with an error.
+    # Left in the reverse order: the workers stop rendering before the pool waits for them, also with an error.
     with ProcessPoolExecutor(min(workers, len(starts)), context, _start_worker, (flight, theirs)) as pool, lifeline:
         with _interrupts_ignored():
             # Its children inherit this: an interrupt may reach them before their first line.

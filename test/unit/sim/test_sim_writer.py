@@ -1,5 +1,7 @@
 from dataclasses import replace
 import math
+import sys
+import time
 
 import cv2
 import numpy as np
@@ -159,6 +161,32 @@ def test_same_seed_same_bytes_with_any_number_of_workers(bag, tmp_path, storage)
     assert len(files) == 7
     for file in files:
         assert (one / file).read_bytes() == (two / file).read_bytes()
+
+
+@pytest.fixture
+def threads_wait():
+    """A thread that computes gives way to no other."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(60.0)
+    yield
+    sys.setswitchinterval(before)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures('threads_wait')
+def test_workers_that_are_sending_frames_do_not_hold_up_an_error(tmp_path):
+    """Had they ended at once, half a result would be in the pipe, and the rest of it waited for for ever."""
+
+    def full_disk(count):
+        until = time.monotonic() + 2.0
+        while time.monotonic() < until:
+            # Meanwhile nobody reads what the workers send.
+            pass
+        raise InputError('no space left')
+
+    with pytest.raises(InputError, match='no space left'):
+        write_flight(tmp_path / 'bag', plan(BEHIND, 8.0, 3, quality=COARSE), workers=4, progress=full_disk)
+    assert not list(tmp_path.iterdir())
 
 
 def test_nothing_is_left_of_a_failed_flight(tmp_path):
