@@ -238,6 +238,19 @@ def test_a_callback_of_any_length_ends_nothing(folder, tmp_path, monkeypatch, ca
     assert 'Traceback' not in capfd.readouterr().err
 
 
+def test_a_recording_that_goes_on_after_its_imu_names_it(folder, capfd):
+    recording = small_bag.recording(SECONDS)
+    ends_ns = small_bag.START_NS + 1_200_000_000
+    recording.events = [event for event in recording.events if event[1] != IMU_TOPIC or event[0] < ends_ns]
+    bag = recording.write(folder / 'silent_imu')
+    given = ['--params', folder / 'params.yaml', '--map', folder / 'map.yaml']
+    assert main([str(word) for word in ('replay', bag, '--out', folder / 'silent_imu_run', *given)]) == 0
+    assert 'must not be flown on' in capfd.readouterr().out
+    page = (folder / 'silent_imu_run' / 'report.html').read_text()
+    # Of 2 s; the first message lies 1 ms behind the start of the flight, the last one 5 ms before the IMU's end.
+    assert 'the IMU was silent from 1.2 s on' in page
+
+
 def test_an_interrupt_while_a_message_is_converted_is_one_line_and_leaves_no_half_a_run(
     folder, tmp_path, monkeypatch, capfd
 ):

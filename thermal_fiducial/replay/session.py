@@ -17,6 +17,7 @@ from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.writing import into, write_text
 from thermal_fiducial.replay.job import ReplayJob
+from thermal_fiducial.replay.last_stamps import LastStamps
 from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
 from thermal_fiducial.replay.recorder import refuse_folder_in_use, RunFiles
@@ -83,13 +84,13 @@ def replay(
                 in_real_time = partial(replay_processes, rate=options.rate, say=say)
                 play = in_real_time if options.transport == 'processes' else replay_lockstep
                 done = partial(_show_share, progress, max(bag.duration_ns, 1))
-                check_interrupt = interrupts.check
-                job = ReplayJob(bag, nodes, also | played, files, recorded, arguments, done, warn, check_interrupt)
+                last, check_interrupt = LastStamps(bag), interrupts.check
+                job = ReplayJob(last, nodes, also | played, files, recorded, arguments, done, warn, check_interrupt)
                 timing = play(job)
                 _report_refusals(files, entry, nodes, warn)
             _report_silence(files, nodes, warn)
             marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)
-            own = {'markers_in_map': len(marker_map.markers)}
+            own = {'markers_in_map': len(marker_map.markers), 'last_ns': last.of_topics}
             summary = _summary(options, settings, bag, played, files) | own | timing
             write_text(options.run / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
     return summary

@@ -10,7 +10,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.report import metrics
 from thermal_fiducial.report.availability import at_frames, Available, available
-from thermal_fiducial.report.interruptions import Interruption, interruptions, run_span
+from thermal_fiducial.report.interruptions import imu_silence_ns, Interruption, interruptions, run_span
 from thermal_fiducial.report.map_error import map_accuracy
 from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.tags import Tag, tags
@@ -99,9 +99,13 @@ class Evaluation:
         return result
 
     def _silence(self) -> dict[str, float]:
-        """Time without a pose at the end of the run [ms]; a filter that is lost gives none."""
+        """Time without a pose and without an IMU message at the end of the run [ms].
+
+        A filter that is lost gives no pose, nor does one without an IMU.
+        """
         fused, (_, last) = self.run.fused.stamps_ns, run_span(self.run)
-        return {'silent_at_end_ms': (last - int(fused[-1])) / 1e6} if len(fused) else {}
+        imu = {'imu_silent_at_end_ms': imu_silence_ns(self.run) / 1e6}
+        return {'silent_at_end_ms': (last - int(fused[-1])) / 1e6} | imu if len(fused) else {}
 
     def _comparable_maps(self) -> tuple[MarkerMap, MarkerMap] | None:
         """Map of the run and the true one; None without either, or without a common marker (no pose ever went out)."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from thermal_fiducial.core.imaging.frame_cleaner import SHUTTER
 from thermal_fiducial.core.types import BoolArray, IntArray, SECOND_NS
+from thermal_fiducial.files.bags import IMU_TOPIC
 from thermal_fiducial.report.metrics import Errors, FRAME_NS, steps
 from thermal_fiducial.report.run_folder import Run
 
@@ -89,6 +90,15 @@ def run_span(run: Run) -> tuple[int, int]:
     end = start + round(run.summary['duration_s'] * SECOND_NS)
     of_one_clock = start - ONE_CLOCK_NS < first and last < end + ONE_CLOCK_NS
     return (min(start, first), max(end, last)) if of_one_clock else (first, last)
+
+
+def imu_silence_ns(run: Run) -> int:
+    """Time from the last IMU message to the end of the recording, by its clock; 0 if unknown."""
+    last = run.summary.get('last_ns', {}).get(IMU_TOPIC)
+    if last is None or 'start_ns' not in run.summary or 'duration_s' not in run.summary:
+        return 0
+    end: int = run.summary['start_ns'] + round(run.summary['duration_s'] * SECOND_NS)
+    return max(0, end - int(last))
 
 
 def frame_holes(frames_ns: IntArray) -> list[tuple[int, int]]:

@@ -186,6 +186,7 @@ _SUMMARY_KINDS: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(('bag', 'bag_path', 'mode', 'transport'), _is_text),
     'start_ns': _is_stamp,
     'duration_s': _is_duration,
+    'last_ns': _is_table_of(_is_stamp),
     'cpu_percent': _is_table_of(_is_number),
     'diagnostics': _is_table_of(_is_table_of(_is_text)),
     'remaps': _is_table_of(_is_text),

@@ -26,6 +26,7 @@ _OUTPUT = (
     ('rate', 'Hz', 'rate_hz'),
     ('longest pause', 'ms', 'longest_pause_ms'),
     ('time without a pose at the end', 'ms', 'silent_at_end_ms'),
+    ('time without the IMU at the end', 'ms', 'imu_silent_at_end_ms'),
     ('step at a correction, 95 %', 'mm', 'step_p95_mm'),
     ('step at a correction, largest', 'mm', 'step_max_mm'),
     ('path length', 'm', 'path_length_m'),

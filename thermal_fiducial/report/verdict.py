@@ -67,7 +67,7 @@ class RunVerdict:
 def judge(evaluation: Evaluation, numbers: dict[str, Any]) -> RunVerdict:
     """The verdict on a run; ``numbers`` are :meth:`Evaluation.numbers`."""
     made = [
-        _output(numbers),
+        _output(evaluation, numbers),
         _error(evaluation, numbers),
         _consistency(numbers),
         _refused(numbers),
@@ -81,12 +81,18 @@ def judge(evaluation: Evaluation, numbers: dict[str, Any]) -> RunVerdict:
     return RunVerdict(tuple(remarks))
 
 
-def _output(numbers: dict[str, Any]) -> Remark:
+def _output(evaluation: Evaluation, numbers: dict[str, Any]) -> Remark:
     fused = numbers['fused']
     if fused['poses'] < 3:
         return Remark(Weight.FAULT, 'The filter gave no pose.')
     silence = fused.get('silent_at_end_ms', 0.0)
     pause, rate = fused['longest_pause_ms'], f'{fused["rate_hz"]:.0f} poses a second'
+    imu_silence = fused.get('imu_silent_at_end_ms', 0.0)
+    # The filter may have been lost before.
+    if imu_silence > max(pause, LONG_PAUSE_MS, silence - LONG_PAUSE_MS):
+        since = evaluation.run.summary['duration_s'] - imu_silence / 1e3
+        cause = f'the IMU was silent from {since:.1f} s on (its driver died, or was stopped before the recording)'
+        return Remark(Weight.FAULT, f'{rate}, but none in the last {imu_silence / 1e3:.1f} s: {cause}.')
     if silence > max(pause, LONG_PAUSE_MS):
         return Remark(Weight.FAULT, f'{rate}, but none in the last {silence / 1e3:.1f} s.')
     if pause > LONG_PAUSE_MS:

@@ -65,6 +65,38 @@ def test_a_filter_that_is_silent_at_the_end_must_not_be_flown_on(tmp_path):
     assert verdict.remarks[0].text == '200 poses a second, but none in the last 4.0 s.'
 
 
+@pytest.mark.parametrize('clock_ns', [0, 5_000_000_000_000])
+@pytest.mark.parametrize(
+    ('imu_ends_s', 'cause'),
+    # The last pose is that of 8 s.
+    [
+        (8.0, ': the IMU was silent from 8.0 s on (its driver died, or was stopped before the recording)'),
+        (8.4, ': the IMU was silent from 8.4 s on (its driver died, or was stopped before the recording)'),
+        (10.0, ''),
+        (SECONDS, ''),
+    ],
+)
+def test_an_imu_that_is_silent_at_the_end_is_named_and_no_lost_filter(tmp_path, clock_ns, imu_ends_s, cause):
+    """Also where the bag was recorded by another clock than that of the stamps."""
+    every = trajectory(200.0)
+    start_ns = START_NS + clock_ns
+    summary = {'start_ns': start_ns, 'duration_s': SECONDS, 'last_ns': {'imu/data': start_ns + round(1e9 * imu_ends_s)}}
+    run = run_of(tmp_path, every.take(every.stamps_ns < START_NS + 8_000_000_000), trajectory(30.0), summary=summary)
+    evaluation = evaluate(run)
+    verdict = judge(evaluation, evaluation.numbers())
+    assert verdict.weight is Weight.FAULT
+    seconds = SECONDS - (imu_ends_s if cause else 8.0)
+    assert verdict.remarks[0].text == f'200 poses a second, but none in the last {seconds:.1f} s{cause}.'
+
+
+def test_an_imu_that_ends_with_the_recording_is_no_fault(tmp_path):
+    summary = {'start_ns': START_NS, 'duration_s': SECONDS, 'last_ns': {'imu/data': START_NS + 11_600_000_000}}
+    evaluation = evaluate(run_of(tmp_path, trajectory(200.0), trajectory(30.0), summary=summary))
+    numbers = evaluation.numbers()
+    assert numbers['fused']['imu_silent_at_end_ms'] == pytest.approx(400.0)
+    assert judge(evaluation, numbers).weight is Weight.GOOD
+
+
 def test_a_bag_of_another_clock_says_nothing_of_the_end(tmp_path):
     run = run_of(tmp_path, trajectory(200.0), trajectory(30.0), summary={'start_ns': 5, 'duration_s': 2 * SECONDS})
     assert breaks.interruptions(run, None) == []
