@@ -1,6 +1,5 @@
 """How noisy the IMU is now: by its data sheet, under vibration, in motion, over gaps and at the end of its range."""
 
-from collections import deque
 import math
 
 import numpy as np
@@ -99,28 +98,32 @@ class StructureFunction:
 
     def __init__(self) -> None:
         self._time = 0.0
-        self._kept: deque[tuple[float, FloatArray]] = deque()
+        #: samples that the next one is compared with, (K,) [s] and (K, 6)
+        self._times, self._samples = np.zeros(0), np.zeros((0, 6))
+        self._newest = -math.inf
         self._weights = np.zeros(len(_LAGS))
         self._measured = np.zeros((len(_LAGS), 2))
 
     def add(self, imu: FloatArray, seconds: float) -> None:
         """Add a sample (6,) that follows the last one after ``seconds``."""
         self._time += seconds
-        if self._kept and self._time - self._kept[-1][0] < _SHORTEST_LAG:
+        if self._time - self._newest < _SHORTEST_LAG:
             return
-        while self._kept and self._time - self._kept[0][0] > _LAGS[-1]:
-            self._kept.popleft()
-        if self._kept:
-            self._compare(imu)
-        self._kept.append((self._time, imu))
+        first = int(self._times.searchsorted(self._time - _LAGS[-1]))
+        times, samples = self._times[first:], self._samples[first:]
+        if len(times):
+            self._compare(imu, times, samples)
+        self._newest = self._time
+        self._times = np.concatenate((times, (self._time,)))
+        self._samples = np.concatenate((samples, imu[None]))
 
-    def _compare(self, imu: FloatArray) -> None:
-        times, samples = (np.array(part) for part in zip(*self._kept, strict=True))
-        squares = ((samples - imu) ** 2).reshape(-1, 2, 3).mean(axis=2)
+    def _compare(self, imu: FloatArray, times: FloatArray, samples: FloatArray) -> None:
+        """Count the differences of a sample from earlier ones (K, 6) at ``times`` (K,)."""
+        squares = ((samples - imu) ** 2).reshape(-1, 2, 3).sum(axis=2) / 3.0
         of_lag = np.rint(np.log2((self._time - times) / _SHORTEST_LAG)) == _OCTAVES[:, None]
         counts = of_lag.sum(axis=1)
         # A plain mean at first, later an exponential one with time constant _MEMORY.
-        new = np.minimum(counts, 1) * min(self._time - times[-1], _MEMORY)
+        new = np.minimum(counts, 1) * min(self._time - self._newest, _MEMORY)
         self._weights = np.minimum(self._weights + new, _MEMORY)
         gain = new / np.maximum(self._weights, _SHORTEST_LAG)
         mean = (of_lag @ squares) / np.maximum(counts, 1)[:, None]
@@ -190,7 +193,7 @@ class NoiseFloor:
         samples = np.array(self._samples)
         differences = samples[:-2] - 2.0 * samples[1:-1] + samples[2:]
         spectrum = np.abs(np.fft.rfft(differences * self._window, axis=0)) ** 2
-        power = (self._bands @ spectrum).reshape(-1, 2, 3).mean(axis=2)
+        power = (self._bands @ spectrum).reshape(-1, 2, 3).sum(axis=2) / 3.0
         self._windows = min(self._windows + 1, _MEAN_OF)
         self._power = self._power + (power - self._power) / self._windows
         if len(power):
