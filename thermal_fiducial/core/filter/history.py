@@ -26,8 +26,8 @@ from thermal_fiducial.core.filter.update import body_pose, Innovation, innovatio
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import SECOND_NS
 
-#: Without poses the propagated estimate is stored at this interval [ns], which bounds what a late pose re-propagates.
-_KEPT_EVERY_NS = 100_000_000
+#: The propagated estimate is stored at this interval [ns], so that a pose begins there and not at the pose before.
+_KEPT_EVERY_NS = 10_000_000
 #: Standard deviation of a suspected step of the IMU's clock as a share of its size: it is all of it or nothing, samples
 #: being lost, with equal odds.
 _STEP_OR_LOSS = 0.5
@@ -211,12 +211,12 @@ class History:
         return pose if due_ns <= self.imu.newest_ns else None
 
     def _go_on(self) -> None:
-        """Propagate the estimate to the newest sample; without poses it becomes a belief every ``_KEPT_EVERY_NS``."""
+        """Propagate the estimate to the newest sample; it becomes a belief every ``_KEPT_EVERY_NS``."""
         belief = self.belief
         if belief.main is None:
             return
         self.main = self._carried(self.main or belief.main, self.imu.newest_ns)
-        if self.main.estimate.stamp_ns - belief.main.estimate.stamp_ns > _KEPT_EVERY_NS:
+        if self.main.estimate.stamp_ns - belief.main.estimate.stamp_ns >= _KEPT_EVERY_NS:
             self._beliefs.append(belief._replace(main=self.main, alternative=self._alternative()))
 
     def _after(self, pose: CameraPose) -> Belief:

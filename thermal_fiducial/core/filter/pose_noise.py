@@ -50,6 +50,11 @@ class BodyPose:
         """(6, 6) the covariance plus the least one: never singular."""
         return self.covariance + _ROUNDING
 
+    @cached_property
+    def of_map(self) -> FloatArray:
+        """(6, 6) ``map_covariance`` in the conventions of ``covariance``."""
+        return self._in_robot_frame(self.map_covariance)
+
     def correlation(self, last: 'BodyPose', angle: float) -> float:
         """Correlation, 0 to 1, of the systematic errors of this pose and of the ``last`` one.
 
@@ -84,11 +89,6 @@ class BodyPose:
         variances, axes = np.linalg.eigh(to_units @ (then - now) @ to_units.T)
         roots = np.linalg.solve(to_units, axes * np.sqrt(np.maximum(variances, 0.0)))
         return np.asarray(roots @ roots.T)
-
-    @property
-    def of_map(self) -> FloatArray:
-        """(6, 6) ``map_covariance`` in the conventions of ``covariance``."""
-        return self._in_robot_frame(self.map_covariance)
 
     def _in_robot_frame(self, map_covariance: FloatArray) -> FloatArray:
         turn = np.zeros((6, 6))

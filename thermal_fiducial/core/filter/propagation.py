@@ -18,17 +18,16 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.imu_buffer import Steps
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
-    ACCELEROMETER_MATRIX,
     BIAS,
     CORE,
     Estimate,
     GRAVITY,
     GYROSCOPE_BIAS,
-    GYROSCOPE_MATRIX,
     MOVED_BY,
     NavigationState,
     POSITION,
     ROTATION,
+    SCALES,
     SIZE,
     TIME_OFFSET,
     VELOCITY,
@@ -38,13 +37,11 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Terms of the exponential's series: exact to 1e-13 for a turn of 0.03 rad, of a brisk flight sampled at 100 Hz, and to
 #: 2e-10 for 0.1 rad, over a gap.
-_TERMS = 6
+_DIVISORS = np.arange(6.0, 1.0, -1.0)[:, None, None, None]
 _IDENTITY = np.eye(9)
 #: Longest time of coasting that is looked ahead [s], and its resolution [s]. A time of hover is divided into so many
 #: steps: the exponential is exact for any, and of the variance by white noise 1 % is missing.
 HORIZON, _TICK, _STEPS = 60.0, 0.05, 5
-#: Scale and cross-axis errors of both triads.
-_SCALES = slice(GYROSCOPE_MATRIX.start, ACCELEROMETER_MATRIX.stop)
 
 
 def _generators() -> FloatArray:
@@ -74,10 +71,10 @@ def step_matrices(imu: FloatArray, seconds: FloatArray) -> StepMatrices:
     A_dt = np.concatenate((imu * dt, dt), axis=1) @ _GENERATORS
     A_dt = A_dt.reshape(-1, 9, 9)
     # Horner's scheme for the mean of the exponential over the step, sum_k (A dt)^k / (k + 1)!
-    mean = _IDENTITY + A_dt / _TERMS
-    for divisor in range(_TERMS - 1, 1, -1):
-        mean = A_dt @ mean
-        mean /= divisor
+    first, *others = A_dt / _DIVISORS
+    mean = _IDENTITY + first
+    for factor in others:
+        mean = factor @ mean
         mean += _IDENTITY
     return StepMatrices(_IDENTITY + A_dt @ mean, mean[..., :6] * dt[..., None])
 
@@ -139,7 +136,7 @@ def _transitions(matrices: StepMatrices, R_map_body: FloatArray, steps: Steps) -
     transitions[..., BIAS] = -matrices.by_imu
     # A scale error acts as a bias of scale times reading.
     shares = matrices.by_imu.reshape(-1, 9, 2, 3, 1) * steps.imu.reshape(-1, 1, 2, 1, 3)
-    transitions[..., _SCALES] = -shares.reshape(-1, 9, 18)
+    transitions[..., SCALES] = -shares.reshape(-1, 9, 18)
     fallen = R_map_body[:, :2].swapaxes(-1, -2) * dt
     transitions[:, VELOCITY, GRAVITY] = fallen
     transitions[:, POSITION, GRAVITY] = fallen * (0.5 * dt)

@@ -23,7 +23,7 @@ ROTATION, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 #: biases of the IMU [rad/s, m/s^2],
 GYROSCOPE_BIAS, ACCELEROMETER_BIAS, BIAS = slice(9, 12), slice(12, 15), slice(9, 15)
 #: scale and cross-axis error matrices of gyroscope and accelerometer, row by row [1],
-GYROSCOPE_MATRIX, ACCELEROMETER_MATRIX = slice(15, 24), slice(24, 33)
+GYROSCOPE_MATRIX, ACCELEROMETER_MATRIX, SCALES = slice(15, 24), slice(24, 33), slice(15, 33)
 #: horizontal components of gravity in the map [m/s^2],
 GRAVITY = slice(33, 35)
 #: clock offset [s],
@@ -86,23 +86,30 @@ class NavigationState:
         derivative[POSITION] = velocity
         return derivative
 
+    def moved(self, error: FloatArray) -> 'NavigationState':
+        """The state with its core corrected by ``error`` (9,): X Exp(xi)."""
+        R_left = self.R_map_body @ so3_left_jacobian(error[ROTATION])
+        return replace(
+            self,
+            R_map_body=orthonormal(self.R_map_body @ so3_exp(error[ROTATION])),
+            velocity=self.velocity + R_left @ error[VELOCITY],
+            position=self.position + R_left @ error[POSITION],
+        )
+
     def plus(self, error: FloatArray) -> 'NavigationState':
         """The state corrected by ``error`` (48,): X Exp(xi) for the group part, a sum for the rest."""
-        R_left = self.R_map_body @ so3_left_jacobian(error[ROTATION])
         T_body_camera = self.T_body_camera
         if error[EXTRINSICS].any():
             turn, shift = error[EXTRINSICS][:3], error[EXTRINSICS][3:]
             T_body_camera = transform(so3_exp(turn), so3_left_jacobian(turn) @ shift) @ T_body_camera
-        return NavigationState(
-            orthonormal(self.R_map_body @ so3_exp(error[ROTATION])),
-            self.velocity + R_left @ error[VELOCITY],
-            self.position + R_left @ error[POSITION],
-            self.bias + error[BIAS],
-            self.scale + error[15:33].reshape(2, 3, 3),
-            with_horizontal(self.gravity, self.gravity[:2] + error[GRAVITY]),
-            self.time_offset + float(error[TIME_OFFSET]),
-            T_body_camera,
-            self.systematic + error[SYSTEMATIC],
+        return replace(
+            self.moved(error[CORE]),
+            bias=self.bias + error[BIAS],
+            scale=self.scale + error[SCALES].reshape(2, 3, 3),
+            gravity=with_horizontal(self.gravity, self.gravity[:2] + error[GRAVITY]),
+            time_offset=self.time_offset + float(error[TIME_OFFSET]),
+            T_body_camera=T_body_camera,
+            systematic=self.systematic + error[SYSTEMATIC],
         )
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'NavigationState':

@@ -11,6 +11,7 @@ from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
 from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_that_stays, WhiteUnits
 from thermal_fiducial.core.filter.state import (
+    CORE,
     Estimate,
     EXTRINSICS,
     GRAVITY,
@@ -128,7 +129,7 @@ def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
     state = prior.state.plus(error)
     if config.estimate_time_offset:
         now = state.derivative(innovation.motion.imu)
-        state = state.plus(of_core((before - now) * error[TIME_OFFSET]))
+        state = state.moved((before - now) * error[TIME_OFFSET])
         covariance = _in_clock_of_imu(config, covariance, now, innovation)
     noise = replace(adapted_noise(innovation), last=innovation.pose)
     return replace(prior, state=state, covariance=covariance, pose_noise=noise)
@@ -231,7 +232,6 @@ def _iterated(innovation: Innovation, gain: FloatArray) -> FloatArray:
     first step, is then larger than what the pose claims. (B. Bell, F. Cathey, "The iterated Kalman filter update as a
     Gauss-Newton method", IEEE TAC 1993.)
     """
-    error = gain @ innovation.value
-    state = innovation.prior.state.plus(error)
-    left = pose_error(state, innovation.pose.T_map_body) - state.systematic
-    return np.asarray(gain @ (left + error[POSE] + error[SYSTEMATIC]))
+    prior, error = innovation.prior.state, gain @ innovation.value
+    left = pose_error(prior.moved(error[CORE]), innovation.pose.T_map_body) - prior.systematic
+    return np.asarray(gain @ (left + error[POSE]))
