@@ -491,12 +491,14 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
         2, 'Most cells of the black border on the wrong side.', minimum=0, maximum=20, dynamic=True
     )
     guided: bool = param(True, 'Search for mapped markers where map and odometry predict them.', dynamic=True)
-    blind_interval: int = param(
-        10,
-        'Frames between blind searches; fewer without a map or when most of the expected markers are not seen. When '
-        'all are seen, the searches alternate between full resolution (small markers) and half (faint ones).',
-        minimum=1,
-        maximum=1000,
+    blind_period: float = param(
+        0.32,
+        'Shortest time between blind searches; at most 0.06 s without a map or when most of the expected markers are '
+        'not seen. When all are seen, the searches alternate between full resolution (small markers) and half (faint '
+        'ones). 0: every frame is searched.',
+        unit='s',
+        minimum=0.0,
+        maximum=60.0,
         dynamic=True,
     )
     max_odometry_age: float = param(

@@ -107,6 +107,26 @@ def test_wrong_prediction_leaves_the_blind_search_to_find_all():
     assert rows['id'].tolist() == sorted(frame.corners_px)
 
 
+@pytest.mark.parametrize('rate', [8.6, 30.0, 60.0])
+def test_a_marker_that_is_not_mapped_is_found_as_soon_at_any_frame_rate(rate):
+    """It comes into view while the mapped ones are where odometry has them: within the period and a frame more."""
+    (frame,) = frames(8.0, 1)
+    found, new = detector(), max(frame.corners_px)
+    found.set_map({key: place for key, place in MAP.items() if key != new})
+    hidden, corners = frame.counts.copy(), np.rint(frame.corners_px[new]).astype(int)
+    (left, top), (right, bottom) = corners.min(axis=0) - 12, corners.max(axis=0) + 12
+    hidden[top:bottom, left:right] = np.median(hidden[top:bottom, left:right])
+    stamps = frame.stamp_ns + np.rint(1e9 / rate * np.arange(int(2.6 * rate))).astype(int)
+    appears, seen = int(1.3 * rate), []
+    for k, stamp_ns in enumerate(stamps.tolist()):
+        counts = hidden if k < appears else frame.counts
+        prior = motion_prior(odometry(replace(frame, stamp_ns=stamp_ns), shift=(0.0, 0.0, 0.0)))
+        seen.append(new in found.detect(stamp_ns, counts, CAMERA, prior)['id'])
+    # Searches alternate between two resolutions, of which one shows it at once.
+    assert seen.index(True) - appears <= rate * 2.0 * CONFIG.blind_period + 1.0
+    assert all(seen[seen.index(True) :])
+
+
 def test_branch_follows_the_map():
     frame = frames(8.0, 1)[0]
     rows = detector().detect(frame.stamp_ns, frame.counts, CAMERA, motion_prior(odometry(frame)))

@@ -1,6 +1,7 @@
 """What odometry says of a frame, with the offset of its clock and without."""
 
 from dataclasses import replace
+import math
 
 import numpy as np
 import pytest
@@ -103,6 +104,6 @@ def test_markers_are_found_whatever_the_offset_of_a_clock_that_is_not_known_yet(
         with_odometry, without = ([marker_id in ids for ids in each] for each in (found, found_blind))
         first = with_odometry.index(True)
         # Where the odometry predicts a marker out of view, it comes with the next blind search.
-        assert first <= without.index(True) + detector.config.blind_interval
+        assert first <= without.index(True) + math.ceil(30.0 * detector.config.blind_period)
         # None that was found is lost again.
         assert np.all(np.array(with_odometry[first:]) >= without[first:])

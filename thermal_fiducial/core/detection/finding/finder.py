@@ -27,14 +27,15 @@ from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
 from thermal_fiducial.core.geometry.se3 import diagonals
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS
 
 # Polarity: memory in frames, and the surplus of markers of one polarity from which on it is certain.
 _FRAMES, _SURE = 30, 6.0
 # Share of the predicted map markers that must be found for the prediction to count as right.
 _ENOUGH = 0.5
-# Longest interval of blind searches [frames] without a map or with a wrong prediction.
-_UNSURE = 2
+# Longest time between blind searches [s] without a map or with a wrong prediction: every other frame at 30 Hz, every
+# one of slow cameras, before which a marker passes in few frames.
+_UNSURE_S = 0.06
 # Least correlation with its pattern of a followed marker, in an image that lag blurs.
 _STILL_SIMILAR = 0.5
 
@@ -48,8 +49,8 @@ class FrameHistory:
     balance: float = 0.0
     #: whether the last frame showed markers that are partially visible
     saw_partial: bool = False
-    #: frames since the last blind search, and the resolutions that it used
-    since_blind: int = 0
+    #: stamp of the last frame that was searched blindly, and the resolutions that were used
+    searched_ns: int | None = None
     scales: SearchScales = SearchScales.ALL
 
     def after(
@@ -58,7 +59,11 @@ class FrameHistory:
         """The history that the frame after one with this twist and these markers starts from."""
         track = self.track.after(stamp_ns, twist, markers)
         balance = self.balance + float(np.sign(markers.cnr).sum()) - self.balance / _FRAMES
-        return FrameHistory(track, balance, saw_partial, self.since_blind, self.scales)
+        return FrameHistory(track, balance, saw_partial, self.searched_ns, self.scales)
+
+    def searched_within(self, stamp_ns: int, seconds: float) -> bool:
+        """Whether the last blind search was less than ``seconds`` before a frame; not so if stamps went back."""
+        return self.searched_ns is not None and 0 <= stamp_ns - self.searched_ns < seconds * SECOND_NS
 
     def polarities(self, rule: str) -> tuple[float, ...]:
         """Possible ones by the parameter ``polarity``: 1 for markers darker than their background, -1."""
@@ -98,13 +103,12 @@ class MarkerFinder:
             complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
             enough = complete or (number > 0 and len(found.ids) >= _ENOUGH * number)
             holds = in_map is not None and enough
-        interval = config.blind_interval if holds else min(config.blind_interval, _UNSURE)
-        since_blind = history.since_blind + 1
-        if (complete or holds) and since_blind < interval:
-            return found, replace(history, since_blind=since_blind)
+        period = config.blind_period if holds else min(config.blind_period, _UNSURE_S)
+        if (complete or holds) and history.searched_within(frame.stamp_ns, period):
+            return found, history
         scales = _next_scales(history, complete=complete)
         blind = self._blind(frame, history, found, scales, known, in_map, config)
-        return found.and_elsewhere(blind), replace(history, since_blind=0, scales=scales)
+        return found.and_elsewhere(blind), replace(history, searched_ns=frame.stamp_ns, scales=scales)
 
     def _guided(
         self,
