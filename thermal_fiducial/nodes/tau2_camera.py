@@ -9,7 +9,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
-from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
+from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner, FROZEN
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.images import image_to_array
@@ -72,9 +72,12 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
 
     def state(self) -> tuple[bytes, str]:
         """Why the last frame was dropped, and faults of the published frames."""
-        if self._reason:
+        repeating = self.cleaner.repeating
+        if self._reason and not (self._reason == FROZEN and repeating):
             return WARN, self._reason
-        return OK, 'ok, but 8-bit images: raw counts give corners ten times as accurate' if self._displayed else 'ok'
+        if self._displayed:
+            return OK, 'ok, but 8-bit images: raw counts give corners ten times as accurate'
+        return OK, f'ok, but {repeating.doubt}' if repeating and repeating.doubt else 'ok'
 
     def headline(self) -> str:
         """Message if the image has been frozen for longer than a shutter event, which is over within a second."""

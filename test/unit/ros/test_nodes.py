@@ -60,6 +60,17 @@ def test_clean_frames_go_out_with_their_stamp_and_frozen_ones_do_not(graph):
     assert graph.diagnose(node)[:2] == (OK, 'ok')
 
 
+def test_a_driver_that_repeats_the_frames_of_a_slow_camera_is_no_fault(graph):
+    """Each frame is sent three or four times, as of 8.6 Hz at 30 Hz; the last one that came is a repeated one."""
+    node, ticks = graph.add(Tau2Camera), [int(k * 60 / 7 / 30) for k in range(45)]
+    pictures = [image_to_array(message) for message in frames(ticks[-1] + 1)]
+    stream = [convert.image(pictures[n], convert.header(START + k * 33_333_333, 'camera')) for k, n in enumerate(ticks)]
+    graph.send('thermal/image_raw', *stream)
+    level, reason, figures = graph.diagnose(node)
+    assert (level, figures['withheld: frozen']) == (OK, str(len(ticks) - len(pictures)))
+    assert reason == 'ok, but new frames come unevenly at 8.7 Hz, as the driver repeats them: stamp_jitter 0.010?'
+
+
 def test_compressed_frames_are_those_that_were_compressed(graph):
     node = graph.add(Tau2Camera, image_transport='compressed')
     graph.listen(Image, 'thermal/image')

@@ -13,6 +13,7 @@ import numpy as np
 
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder
+from thermal_fiducial.core.imaging.repeated_frames import Pauses, Repeating
 from thermal_fiducial.core.measurements import LATEST_NS
 from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.core.types import Counts, Gray, IntArray
@@ -72,6 +73,11 @@ class FrameCleaner:
         self._finder = BadPixelFinder(shape)
         self._found: IntArray = np.zeros((0, 2), np.int64)
         self._filler = BadPixelFiller(self._known_bad, shape) if shape != (0, 0) else None
+
+    @property
+    def repeating(self) -> Repeating | None:
+        """How the driver repeats the camera's frames; None if it does not, or while nothing new comes."""
+        return self._pauses.repeating
 
     @property
     def bad_pixels(self) -> IntArray:
@@ -161,54 +167,6 @@ def _carries(rows: Counts, bits: int) -> bool:
 def _break_between(frame: Counts | Gray, row: int) -> float:
     """Mean difference between ``row`` and the one above it [counts]."""
     return float(np.mean(np.abs(frame[row].astype(np.int32) - frame[row - 1])))
-
-
-class Pauses:
-    """Period of new frames, and which new frames after a longer pause may still hold old counts.
-
-    A driver may send each frame several times. The period is the median of the last intervals between new frames, so
-    that neither a shutter event nor the beat of two clocks (a frame now and then stands for two ticks of the driver)
-    changes it. Frames are counted by their stamps: late ones from before the pause have nothing to settle.
-    """
-
-    #: Of a Tau 2 at full rate: until a second frame has come.
-    ASSUMED_NS = 33_333_333
-    INTERVALS = 9
-    #: Periods without anything new that are a pause. A frame that was lost makes two of one, an FFC of 0.35 s
-    #: is 2.6 of the slowest cameras (7.5 Hz).
-    LONG = 2.5
-
-    def __init__(self) -> None:
-        self._newest_ns: int | None = None
-        self._intervals_ns: deque[int] = deque(maxlen=self.INTERVALS)
-        self._left = 0
-        self._paused_ns = self._settled_ns = 0
-
-    def add_new(self, stamp_ns: int) -> bool:
-        """Log a new frame; whether it may still hold old counts."""
-        # Late frames are no measure of the period.
-        if self._newest_ns is not None and stamp_ns > self._newest_ns:
-            self._intervals_ns.append(stamp_ns - self._newest_ns)
-        self._newest_ns = stamp_ns if self._newest_ns is None else max(stamp_ns, self._newest_ns)
-        if stamp_ns < self._paused_ns:
-            return False
-        if self._left == 0:
-            return stamp_ns < self._settled_ns
-        self._left -= 1
-        self._settled_ns = max(stamp_ns, self._settled_ns)
-        return True
-
-    def add_old(self, stamp_ns: int, settling: int) -> None:
-        """Log a repeated or shutter frame; after a longer pause the next ``settling`` new frames are withheld.
-
-        A few repeated frames are a driver that runs faster than the camera. After a longer pause the first new frame
-        may still hold old counts: in the bolometers, which lag, and in the driver's buffers.
-        """
-        period = (
-            sorted(self._intervals_ns)[(len(self._intervals_ns) - 1) // 2] if self._intervals_ns else self.ASSUMED_NS
-        )
-        if self._newest_ns is not None and stamp_ns - self._newest_ns > self.LONG * period:
-            self._paused_ns, self._left = max(stamp_ns, self._paused_ns), settling
 
 
 class FreezeDetector:
