@@ -11,16 +11,20 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.core.error_model import CHI2_OF_POSE, of_correlated_odometry, of_single_error
+from thermal_fiducial.core.frame_period import FramePeriod
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract, turned
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: A pose of the second camera is carried on to a frame of the first over at most this [ns]: two periods at 30 Hz.
-_CARRIED_NS = 70_000_000
-#: The second camera stands in when the first has had no pose for this long [ns].
-_ALONE_NS = 120_000_000
+#: A pose of the second camera is carried on to a frame of the first over at most this [ns]: two periods at 30 Hz. With
+#: a slower first camera over a period of that: then each of its frames has one of the second to be fused with. The
+#: longest is beyond the slowest cameras, of 7.5 Hz; a jerk of 10 m/s^3 displaces by 1.4 mm meanwhile.
+_CARRIED_NS, _LONGEST_NS = 70_000_000, 150_000_000
+#: The second camera stands in when the first has had no pose for a period and this long [ns]: what transport, its
+#: detector and the difference of the clocks delay it by.
+_LATE_NS = 87_000_000
 #: Factor on its variance by poses that contradict each other: a clock may have stepped.
 _DOUBT = 2.0
 
@@ -91,7 +95,9 @@ class SecondCamera:
         self._T_body_first = T_body_first
         self._T_second_first = inverse(T_body_second) @ T_body_first
         self._waiting: CameraPose | None = None
+        #: stamp of the first camera's last pose, and period of its poses
         self._first_ns: int | None = None
+        self._period = FramePeriod()
         self.clock = SecondClock(time_offset_std, time_offset_random_walk)
         #: number of fused frames, of the second's poses published alone, and of those that contradicted the first
         self.joined = self.alone = self.contradicted = 0
@@ -99,7 +105,7 @@ class SecondCamera:
     def add_second(self, pose: CameraPose, prior: MotionPrior) -> CameraPose | None:
         """Add a pose of the second camera; returned as a pose of the first, in its clock, while that has none."""
         pose = seen_from(pose, self._T_second_first)
-        if self._first_ns is None or pose.stamp_ns - self._first_ns > _ALONE_NS:
+        if self._first_ns is None or pose.stamp_ns - self._first_ns > self._period_ns + _LATE_NS:
             self.alone += 1
             in_clock = self._in_clock_of_first(pose, pose.stamp_ns, prior)
             return pose if in_clock is None else in_clock[0]
@@ -110,7 +116,8 @@ class SecondCamera:
         """A pose of the first camera fused with the latest of the second, extrapolated by odometry."""
         waiting, self._waiting = self._waiting, None
         self._first_ns = pose.stamp_ns
-        if waiting is None or abs(pose.stamp_ns - waiting.stamp_ns) > _CARRIED_NS:
+        self._period.add(pose.stamp_ns)
+        if waiting is None or abs(pose.stamp_ns - waiting.stamp_ns) > max(_CARRIED_NS, self._period_ns):
             return pose
         in_clock = self._in_clock_of_first(waiting, pose.stamp_ns, prior)
         if in_clock is None:
@@ -125,6 +132,10 @@ class SecondCamera:
         apart = difference(there.T_map_camera, pose.T_map_camera)
         self.clock.add(pose.stamp_ns, apart, velocity, pose.covariance + moved.covariance)
         return joint
+
+    @property
+    def _period_ns(self) -> int:
+        return min(self._period.ns, _LONGEST_NS)
 
     def _in_clock_of_first(
         self, pose: CameraPose, stamp_ns: int, prior: MotionPrior

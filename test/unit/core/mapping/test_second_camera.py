@@ -134,6 +134,21 @@ def test_each_pose_counts_once_and_an_old_one_not_at_all():
     assert cameras.with_second(late, flying(0.0)) is late
 
 
+@pytest.mark.parametrize('rate', [7.5, 8.6, 30.0, 60.0])
+@pytest.mark.parametrize('lead', [0.05, 0.5, 0.95])
+def test_two_cameras_of_any_frame_rate_are_joined_and_never_take_turns(rate, lead):
+    """The second's frames come a ``lead`` of a period before the first's: all but the first few have a partner."""
+    cameras, prior = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), MotionPrior()
+    cameras.with_second(pose(0, T_BODY_FIRST), prior)
+    for k in range(1, 31):
+        second_ns, first_ns = (round((k - ahead) / rate * 1e9) for ahead in (lead, 0.0))
+        for stamp_ns in range(first_ns - 130 * MS, first_ns + MS, 5 * MS):
+            prior.add(stamp_ns, Odometry(stamp_ns, np.eye(4), np.zeros(3), np.zeros(3), *[1e-6 * np.eye(6)] * 2))
+        assert cameras.add_second(second_pose(second_ns, np.eye(4)), prior) is None or k < 3
+        cameras.with_second(pose(first_ns, T_BODY_FIRST), prior)
+    assert cameras.joined >= 27
+
+
 def swung(seconds):
     """Pose of a robot that swings along x, by 0.5 m at up to 1 m/s."""
     return transform(np.eye(3), [0.5 * np.sin(2.0 * seconds), 0.0, 0.0])
