@@ -44,8 +44,8 @@ LARGEST_TILT = math.radians(35.0)
 HINT_SECONDS = 10.0
 #: Largest distance of the robot from its last pose: a constant [m] and a speed [m/s].
 _NEAR, _SPEED = 0.5, 3.0
-#: Poses in a row that contradict the hint until it is dropped: a second at 30 Hz.
-_PROOF = 30
+# Time for which poses in a row contradict the hint until it is dropped [ns], and fewest poses that must do so.
+_PROOF_NS, _FEWEST = SECOND_NS, 5
 
 
 def blank_state(config: PoseEkfConfig) -> NavigationState:
@@ -160,17 +160,22 @@ class RestartHint:
     def __init__(self, last: LastPose, T_body_camera: FloatArray) -> None:
         self._last = last
         self._T_camera_body = inverse(T_body_camera)
-        self._contradictions = 0
+        #: stamp of the first of the latest poses in a row that contradict the hint, and their number
+        self._since_ns, self._contradictions = 0, 0
+        self._dropped = False
 
     def contradiction(self, pose: CameraPose) -> float:
         """Distance [m] of an implausibly far pose from the last one; 0 if the pose is plausible."""
         seconds = (pose.stamp_ns - self._last.stamp_ns) / SECOND_NS
-        if not 0.0 <= seconds <= HINT_SECONDS or self._contradictions >= _PROOF:
+        if not 0.0 <= seconds <= HINT_SECONDS or self._dropped:
             return 0.0
         position = (pose.T_map_camera @ self._T_camera_body)[:3, 3]
         distance = float(np.linalg.norm(position - self._last.T_map_body[:3, 3]))
         if distance <= _NEAR + _SPEED * seconds:
             self._contradictions = 0
             return 0.0
+        if self._contradictions == 0:
+            self._since_ns = pose.stamp_ns
         self._contradictions += 1
-        return distance
+        self._dropped = self._contradictions > _FEWEST and pose.stamp_ns - self._since_ns >= _PROOF_NS
+        return 0.0 if self._dropped else distance
