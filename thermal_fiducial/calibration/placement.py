@@ -19,24 +19,6 @@ _QUARTER = np.array([[0, -1], [1, 0]])
 
 
 @dataclass(frozen=True)
-class GridRefusal:
-    """Why a grid is not the board.
-
-    Parameters
-    ----------
-    reason : in words
-    covered : number of board points that may be in the grid; 0 where most of the board is not
-    larger : whether it may be the board nevertheless, if its points beyond the board are clutter
-    another : whether it is another board if those points are none
-    """
-
-    reason: str
-    covered: int = 0
-    larger: bool = False
-    another: bool = False
-
-
-@dataclass(frozen=True)
 class GridPlacement:
     """Placement of a board in a grid.
 
@@ -50,6 +32,24 @@ class GridPlacement:
     rows: IntArray
     beyond: IntArray
     beyond_nodes: IntArray
+
+
+@dataclass(frozen=True)
+class GridRefusal:
+    """Why a grid is not the board.
+
+    Parameters
+    ----------
+    reason : in words
+    covered : number of board points that may be in the grid; 0 where most of the board is not
+    placed : where the board may be nevertheless, if the grid's points beyond it are clutter
+    another : whether it is another board if those points are none
+    """
+
+    reason: str
+    covered: int = 0
+    placed: GridPlacement | None = None
+    another: bool = False
 
 
 class BoardNodes:
@@ -85,15 +85,15 @@ class BoardNodes:
         if most < _LEAST_SHARE * count:
             return GridRefusal(f'a grid of {len(grid)} points that is not like the board')
         unclear = most - second < _CLEAR * self._margin
+        placement = self._best(grid, overlaps)
         # A few extra points belong to another board if all of this one is seen, and are clutter if its border is not.
         if beyond > _BEYOND * count + 1.0 or (unclear and beyond > 0 and most >= (1.0 - _BEYOND) * count):
-            return GridRefusal(goes_on(beyond), int(most), larger=True, another=True)
-        placement = self._best(grid, overlaps)
+            return GridRefusal(goes_on(beyond), int(most), placement, another=True)
         if unclear:
             # Clutter makes a place unclear only if it is clear without.
             reason = f'{most:.0f} of {count} points found, which may lie in more than one place of the board'
             clear = beyond > 0 and isinstance(self.place(grid[placement.rows]), GridPlacement)
-            return GridRefusal(reason, int(most), larger=clear)
+            return GridRefusal(reason, int(most), placement if clear else None)
         return placement
 
     def _best(self, grid: IntArray, overlaps: list[FloatArray]) -> GridPlacement:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.calibration.appearance import Appearance
-from thermal_fiducial.calibration.grid_search import BoardPoints, find_board, RefusedGrid
+from thermal_fiducial.calibration.grid_search import BoardPoints, find_board, GridSearch, RefusedGrid
 from thermal_fiducial.calibration.keypoints import Keypoints
 from thermal_fiducial.calibration.placement import BoardNodes, goes_on, GridRefusal
 from thermal_fiducial.calibration.refusals import median_spacing, why_refused, why_unlike
@@ -55,13 +55,11 @@ def recognise(
     """
     search = find_board(keypoints, board)
     seen, larger = search.placed, search.refused
-    if larger is not None and (not larger.refusal.larger or (seen and len(seen.points) >= larger.refusal.covered)):
-        larger = None
-    good_of_larger = None if larger is None else _good(image, larger, appearance)
+    good_of_larger = _good_of_larger(image, search, appearance)
     if seen is not None:
         return _checked(image, seen, board, appearance, another, _Known(good_of_larger, tone_curve))
     if larger is None or good_of_larger is None or len(good_of_larger.points) < _ALIKE * len(larger.nodes):
-        raise BoardNotFound(why_refused(image, search.refused, board, appearance))
+        raise BoardNotFound(why_refused(image, larger, board, appearance))
     return _within(image, larger, good_of_larger, board, appearance, another)
 
 
@@ -72,10 +70,17 @@ class _Known(NamedTuple):
     tone_curve: bool
 
 
-def _good(image: Float32Array, grid: RefusedGrid, appearance: Appearance) -> Recognised:
-    """Rows and pixels of the points of a grid that look like points of the board."""
+def _good_of_larger(image: Float32Array, search: GridSearch, appearance: Appearance) -> Recognised | None:
+    """Rows and pixels of the points that look like the board's, of a refused grid that covers most of it.
+
+    Its points beyond the board are judged by those of the board: in a row of clutter each is as faint as the others.
+    """
+    seen, grid = search.placed, search.refused
+    if grid is None or grid.refusal.placed is None or (seen and len(seen.points) >= grid.refusal.covered):
+        return None
     nodes = grid.nodes.astype(np.float64)
-    pixels = refine(image, nodes, grid.pixels, nodes, appearance).pixels
+    of_board = np.isin(np.arange(len(nodes)), grid.refusal.placed.rows)
+    pixels = refine(image, nodes, grid.pixels, nodes, appearance, grid=of_board).pixels
     good = np.flatnonzero(np.isfinite(pixels[:, 0]))
     return Recognised(good, pixels[good])
 

@@ -249,6 +249,14 @@ def test_clutter_that_continues_the_grid_makes_no_larger_board():
     assert errors(sighting, points, truth).max() < 0.03
 
 
+def test_outer_corners_of_squares_beside_a_hot_border_make_no_larger_board():
+    """Five saddles a step beyond the board, of half its contrast: each was judged by the four others."""
+    shares, error = look(CHESSBOARD, Heat(contrast=2.0, lamp=15.0), (2,), fill=SMALL)
+    assert np.all(shares == 1.0)
+    # As in test_chessboard.
+    assert np.sqrt(np.mean(error**2)) < 0.05
+
+
 @pytest.mark.parametrize('contrast', [6.0, -6.0])
 def test_the_first_grid_that_is_grown_is_the_board(monkeypatch, contrast):
     """Neither the gaps between dots, nor edges of dots at finer scales are tried before the dots."""
