@@ -15,8 +15,6 @@ import numpy as np
 from support.mapper_scenes import Figures, SCENES
 from support.taken_out import ablation_row, lines_of
 
-from thermal_fiducial.core.error_model import map_of_pose, scale_of_map
-
 MAPPING = 'thermal_fiducial.core.mapping'
 #: Change of a figure that is worth printing.
 NOTABLE = 0.05
@@ -47,11 +45,9 @@ def _ignored(*_: Any, **__: Any) -> None:
     return None
 
 
-def _bounded(self: Any, gains: Any, camera_position: Any) -> Any:
-    """A pose's error by the map whose markers' errors are correlated in any way."""
-    sight = self.sight
-    rest = sight.map_covariances - scale_of_map(sight.scale_arms, self.model)
-    return map_of_pose(gains, rest, sight.T_map_marker[:, :3, 3], camera_position)
+def _independent(gains: Any, draws: Any) -> Any:
+    """Draws of a pose's error by markers whose errors have nothing in common."""
+    return np.sqrt(len(draws)) * np.concatenate(list(gains @ draws), axis=-1)
 
 
 MECHANISMS = {
@@ -107,9 +103,9 @@ MECHANISMS = {
         {'error_sources:LensErrors': lambda *_: SimpleNamespace(drawn=lambda chosen: 0.0)},
     ),
     'joint draws of the map': Mechanism(
-        ('bent corridor', 'wall'),
-        ('localization:_JointFit._of_map', 'error_sources:ErrorSources.noise'),
-        {'localization:_JointFit._of_map': _bounded},
+        ('bent corridor', 'wall', 'uneven map'),
+        ('error_sources:ErrorSources.noise',),
+        {'localization:drawn_sum': _independent},
     ),
     'priors': Mechanism(
         ('second flight', 'chain'), ('keyframes:prior_poses',), {'keyframes:prior_poses': lambda *_: {}}

@@ -35,12 +35,11 @@ class SystematicErrors:
     #: choice between two poses, and weights by the map.
     decision_px: float = 0.1
     #: Common relative error of the markers' sides: ways of measuring tags on one carpet differ by 1.2 %, a laser
-    #: cutter's kerf of 0.3 mm is 0.1 %. Enters poses from markers (:func:`of_single_error`) and the map
-    #: (:func:`scale_of_map`).
+    #: cutter's kerf of 0.3 mm is 0.1 %. Enters poses from markers, new markers and the map (:func:`scale_of_map`).
     marker_size_std: float = 0.003
     #: Relative error of the focal length: a calibration with a board is good to 0.1 to 0.3 %. It moves the camera along
-    #: its axis by as much of the distance to the markers, in maps with exact sizes too. Enters poses from markers
-    #: (:func:`of_single_error`).
+    #: its axis by as much of the distance to the markers, in maps with exact sizes too. Enters poses from markers and
+    #: new markers.
     focal_length_std: float = 0.002
     #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges. To
     #: begin with, and at most, as measured on rendered flights with three lenses and 0.5 to 9 K; learned in flight from
@@ -52,9 +51,6 @@ class SystematicErrors:
 CHI2_OF_POSE, CHI2_OF_VIEW = 22.5, 26.1
 #: For data without systematic errors: simulated corners.
 NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0)
-#: Share of the variance of the best-known marker in view that is common to all markers of the rigid map: the error of
-#: the gauge. In maps from flights past eight markers nearly all is; the rest covers markers surveyed one by one.
-MAP_COMMON = 0.75
 #: Errors of successive odometry poses are correlated for seconds: this many count as one.
 CORRELATED_ODOMETRY = 30.0
 #: Part of the re-projection error, by bent plates and corner bias, that is no sign of an inconsistent marker [px].
@@ -69,6 +65,10 @@ WHITE_PX = 0.5
 
 #: Joint draws of the errors of a map: standard deviations by 64 are accurate to a tenth, those by the lens exact.
 DRAWS = 64
+#: Those of a marker whose place is known exactly.
+NO_DRAWS: FloatArray = np.zeros((6, DRAWS))
+#: Smallest part of the largest standard deviation of a marker's error that a common error is compared with.
+_LEAST_STD = 1e-6
 
 
 # Poses from the corners of a frame.
@@ -123,34 +123,13 @@ def corners_of_pose(gains: FloatArray, correlations: FloatArray, errors: Systema
     return np.asarray(errors.corner_px**2 * np.tensordot(gains, mixed, axes=([0, 2], [0, 2])))
 
 
-def map_of_pose(
-    gains: FloatArray, covariances: FloatArray, positions: FloatArray, camera_position: FloatArray
-) -> FloatArray:
-    """Covariance (6, 6) of a camera pose by the errors of the map, without its scale.
-
-    The common error of the markers moves the camera rigidly with the map; for the rest the bound of any correlations is
-    used.
-
-    Parameters
-    ----------
-    gains : (N, 6, 6) derivative of the pose by the pose of each marker
-    covariances, positions : (N, 6, 6), (N, 3) of the markers
-    camera_position : (3,)
-    """
-    best = int(np.argmin(np.trace(covariances, axis1=1, axis2=2)))
-    arms = np.concatenate([positions, camera_position[None]]) - positions[best]
-    A = lever_arm(arms)
-    common = MAP_COMMON * A @ positive(covariances[best]) @ np.swapaxes(A, -1, -2)
-    return np.asarray(common[-1] + correlated_sum(gains, positive(covariances - common[:-1])))
-
-
 def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
-    """Covariance (m, m) by one scalar error with derivative ``moved`` (m,): scale, clock offset, or the other pose.
+    """Covariance (m, m) by one scalar error with derivative ``moved`` (m,): clock offset, or the other pose.
 
     Parameters
     ----------
-    std : standard deviation of the error: ``marker_size_std`` for the scale, ``focal_length_std`` for the lens, that of
-        the clock offset [s] for a velocity, 1 for the difference of two possible poses
+    std : standard deviation of the error: that of the clock offset [s] for a velocity, 1 for the difference of two
+        possible poses
     """
     return np.asarray(std**2 * np.outer(moved, moved))
 
@@ -187,6 +166,38 @@ def scale_of_map(arms: FloatArray, errors: SystematicErrors) -> FloatArray:
     covariances = np.zeros((len(arms), 6, 6))
     covariances[:, :3, :3] = errors.marker_size_std**2 * arms[:, :, None] * arms[:, None, :]
     return covariances
+
+
+def assumed_draws(positions: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Joint draws (M, 6, K) of the errors of a map's M markers, of which only the covariance of each is known.
+
+    Each is assumed to have been placed by its nearest better-known one: it has the error of that, moved rigidly, as far
+    as its own covariance allows, and the rest by itself.
+
+    Parameters
+    ----------
+    positions, covariances : (M, 3), (M, 6, 6)
+    """
+    rng, draws = np.random.default_rng(0), np.zeros((len(positions), 6, DRAWS))
+    order = np.argsort(np.trace(covariances, axis1=1, axis2=2), kind='stable')
+    for place, index in enumerate(order.tolist()):
+        inherited = NO_DRAWS
+        if place:
+            arms = positions[index] - positions[order[:place]]
+            nearest = int(np.argmin(np.sum(arms**2, axis=1)))
+            inherited = lever_arm(arms[nearest]) @ draws[order[nearest]]
+        draws[index] = draws_of(covariances[index], rng, inherited)
+    return draws
+
+
+def draws_of(covariance: FloatArray, rng: np.random.Generator, inherited: FloatArray = NO_DRAWS) -> FloatArray:
+    """Draws (6, K) of an error of just this ``covariance``, with as much of the ``inherited`` ones as it allows."""
+    root = root_of(covariance)
+    whitened = np.linalg.pinv(root, _LEAST_STD) @ inherited / np.sqrt(DRAWS)
+    axes, stds, shared = np.linalg.svd(whitened, full_matrices=False)
+    stds = np.minimum(stds, 1.0)[:, None]
+    own = np.linalg.qr(np.concatenate([shared, rng.standard_normal(shared.shape)]).T)[0].T[6:]
+    return np.asarray(np.sqrt(DRAWS) * root @ axes @ (stds * shared + np.sqrt(1.0 - stds**2) * own))
 
 
 def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
@@ -250,35 +261,13 @@ def covariance_of(draws: FloatArray) -> FloatArray:
     return np.asarray(draws @ np.swapaxes(draws, -1, -2) / draws.shape[-1])
 
 
-def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Upper bound (m, m) of the covariance of ``sum_i gains_i x_i`` for any correlations of the ``x_i``.
-
-    Errors of the markers of a map, and of camera poses in the same map, have unknown correlations. For any weights a_i
-    that sum to one, ``sum_i gains_i P_i gains_i' / a_i`` is an upper bound (as in covariance intersection; S. Julier,
-    J. Uhlmann, 1997); these a_i minimise its trace.
-
-    Parameters
-    ----------
-    gains : (n, m, 6)
-    covariances : (n, 6, 6)
-    """
-    return bounded_sum(gains @ covariances @ np.swapaxes(gains, -1, -2))
-
-
-def bounded_sum(terms: FloatArray) -> FloatArray:
-    """Upper bound (m, m) of the covariance of a sum for any correlations of its terms; covariances (n, m, m)."""
-    # Rotations and metres are made comparable by the terms' own mean variances.
-    variances = np.diagonal(terms, axis1=-2, axis2=-1)
-    total = np.sum(variances, axis=0)
-    shares = np.sqrt(np.sum(variances / np.where(total > 0.0, total, 1.0), axis=-1))
-    used = shares > 0.0
-    if not np.any(used):
-        return np.zeros(terms.shape[1:])
-    weights = shares[used] / np.sum(shares[used])
-    return np.asarray(np.sum(terms[used] / weights[:, None, None], axis=0))
-
-
 def positive(covariances: FloatArray) -> FloatArray:
     """The nearest positive semidefinite matrices (..., 6, 6)."""
+    root = root_of(covariances)
+    return np.asarray(root @ np.swapaxes(root, -1, -2))
+
+
+def root_of(covariances: FloatArray) -> FloatArray:
+    """Roots R (..., 6, 6) of covariances R R', of the nearest positive semidefinite ones."""
     values, vectors = np.linalg.eigh(0.5 * (covariances + np.swapaxes(covariances, -1, -2)))
-    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])

@@ -89,8 +89,7 @@ def _settle(mapper: MarkerMapper, camera: Camera) -> bool:
     for candidate in mapper.candidates.values():
         winner = decide(snapshot, candidate.id, candidate.size, candidate.solutions(camera)[:2])
         if winner is not None:
-            mapper.enter(candidate.views[-1].stamp_ns, candidate, winner.T_map_marker, winner.covariance)
-            mapper.map.revision += 1
+            mapper.enter(winner)
             return True
     return False
 

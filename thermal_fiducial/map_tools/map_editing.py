@@ -68,7 +68,7 @@ def delete(marker_map: MarkerMap, ids: Iterable[int]) -> MarkerMap:
 
 
 def transformed(marker_map: MarkerMap, T_new_old: FloatArray) -> MarkerMap:
-    """The map in another frame, covariances included; joint draws of its errors are left out, as in a file."""
+    """The map in another frame, covariances included."""
     return _changed(
         marker_map,
         {
@@ -76,7 +76,6 @@ def transformed(marker_map: MarkerMap, T_new_old: FloatArray) -> MarkerMap:
                 marker,
                 T_map_marker=T_new_old @ marker.T_map_marker,
                 covariance=turned(marker.covariance, T_new_old[:3, :3]),
-                draws=None,
             )
             for key, marker in marker_map.markers.items()
         },

@@ -98,7 +98,7 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
     sources = ErrorSources(problem, system, now, weights, np.random.default_rng(0))
     lasting = sources.lasting(snapshot.errors)
     covariances += covariance_of(lasting)
-    draws = lasting + sources.noise(widened, of_held)
+    draws = lasting + sources.noise(widened, np.stack([snapshot.markers[key].draws for key in problem.ids]))
     covariances += scale_of_map(arms_of_scale(positions, positions[problem.held]), snapshot.errors)
     if not np.all(np.isfinite(covariances)):
         return None

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import noise_factor, SystematicErrors
+from thermal_fiducial.core.error_model import NO_DRAWS, noise_factor, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.keyframes import Displacement
@@ -43,7 +43,7 @@ class Placement:
     covariance: FloatArray
     reason: str = ''
     #: (6, K) of :class:`MapMarker`
-    draws: FloatArray | None = None
+    draws: FloatArray = field(default_factory=lambda: NO_DRAWS)
 
 
 @dataclass
@@ -160,8 +160,18 @@ class NewMarkers:
             placement = candidate.place(camera, errors)
             candidate.reason = placement.reason
             if placement.T_map_marker is not None:
-                marker = entry(stamp_ns, candidate, placement.T_map_marker, placement.covariance)
-                placed.append(replace(marker, draws=placement.draws))
+                placed.append(
+                    MapMarker(
+                        candidate.id,
+                        candidate.size,
+                        False,
+                        placement.T_map_marker,
+                        placement.covariance,
+                        first_seen_ns=stamp_ns,
+                        last_seen_ns=stamp_ns,
+                        draws=placement.draws,
+                    )
+                )
                 del self.candidates[candidate.id]
         while len(self.candidates) > MOST:
             del self.candidates[min(self.candidates, key=lambda key: self.candidates[key].views[-1].stamp_ns)]
@@ -171,10 +181,3 @@ class NewMarkers:
         """Apply a displacement of the map to all candidates."""
         for candidate in self.candidates.values():
             candidate.move(displacement)
-
-
-def entry(stamp_ns: int, candidate: Candidate, T_map_marker: FloatArray, covariance: FloatArray) -> MapMarker:
-    """A candidate as a marker of the map."""
-    return MapMarker(
-        candidate.id, candidate.size, False, T_map_marker, covariance, first_seen_ns=stamp_ns, last_seen_ns=stamp_ns
-    )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import DRAWS, shape_of_corners, SystematicErrors
+from thermal_fiducial.core.error_model import DRAWS, root_of, shape_of_corners, SystematicErrors
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem
 from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
@@ -35,11 +35,11 @@ class ErrorSources:
         Parameters
         ----------
         widened : factor of the variances of corners and priors
-        of_held : (M, 6, 6) covariances of the held markers, others are not used
+        of_held : (M, 6, K) draws of the held markers, others are not used
         """
         problem, roots = self.problem, np.sqrt(widened * self.weights)[:, None, None]
         of_frame, of_marker = (
-            np.sqrt(widened) * _root(priors.information) for priors in (problem.odometry, problem.known)
+            np.sqrt(widened) * root_of(priors.information) for priors in (problem.odometry, problem.known)
         )
         parts = []
         for _ in range(0, DRAWS, _AT_ONCE):
@@ -47,8 +47,7 @@ class ErrorSources:
             of_frames += of_frame @ self._normal(len(of_frame), 6)
             of_markers += of_marker @ self._normal(len(of_marker), 6)
             parts.append(self.system.solve(of_frames, of_markers)[1])
-        held = _root(of_held) @ self.rng.standard_normal((len(of_held), 6, DRAWS))
-        return np.concatenate(parts, axis=-1) + self.system.by_held(held)
+        return np.concatenate(parts, axis=-1) + self.system.by_held(of_held)
 
     def lasting(self, errors: SystematicErrors) -> FloatArray:
         """(M, 6, K) by corner errors that are the same in all views of a marker, and by those of the lens.
@@ -87,9 +86,3 @@ class ErrorSources:
         middle = np.cumsum(views) - 1 - views // 2
         typical = 1.0 / precision[np.lexsort((precision, problem.marker))[middle]]
         return shape_of_corners(views / np.bincount(problem.marker, precision), typical, errors)
-
-
-def _root(matrices: FloatArray) -> FloatArray:
-    """Square roots (n, 6, 6) of positive semidefinite matrices."""
-    values, vectors = np.linalg.eigh(matrices)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])

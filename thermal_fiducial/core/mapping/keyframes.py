@@ -8,6 +8,7 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import (
     divided_prior,
+    draws_of,
     NO_SYSTEMATIC_ERRORS,
     of_correlated_odometry,
     SystematicErrors,
@@ -171,10 +172,9 @@ class KeyframeStore:
             self.add(keyframe)
         if self._gap is None:
             self._gap = predicted.pose
-        # The covariance of the odometry at the gap's first marker is the common error of all views.
-        return Viewpoint.known(
-            predicted.pose.T_map_camera, displacement_covariance(self._gap, predicted), self._gap.covariance
-        )
+        # The error of the odometry at the gap's first marker is common to all views.
+        draws = draws_of(self._gap.covariance, np.random.default_rng(abs(self._gap.stamp_ns)))
+        return Viewpoint.known(predicted.pose.T_map_camera, displacement_covariance(self._gap, predicted), draws)
 
     def bridgeable(self, stamp_ns: int, longest: float) -> bool:
         """Whether known markers were in view not more than ``longest`` [s] before."""
@@ -204,8 +204,7 @@ class KeyframeStore:
         frames = self._selected(views)
         number = sum(len(frame.ids) for frame in frames)
         self._adjustment = LastAdjustment(next(reversed(self.frames)), len(self.frames), number, markers, self._added)
-        # Without draws, which are made anew: the input goes to another process.
-        trusted = {key: replace(m, draws=None) for key, m in marker_map.markers.items() if m.trusted}
+        trusted = {key: marker for key, marker in marker_map.markers.items() if marker.trusted}
         return snapshot_of(trusted, frames, self._priors, marker_map.revision, errors)
 
     def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:

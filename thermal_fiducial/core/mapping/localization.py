@@ -10,20 +10,15 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.error_model import (
-    bounded_sum,
     corner_correlations,
     corners_of_pose,
-    correlated_sum,
     covariance_of,
     decision_weights,
     drawn_sum,
-    map_of_pose,
     map_weights,
     noise_factor,
     noise_of_pose,
     of_single_error,
-    positive,
-    scale_of_map,
     SystematicErrors,
 )
 from thermal_fiducial.core.geometry.camera import Camera, inverse_2x2
@@ -156,10 +151,10 @@ class _JointFit:
         of_scale = np.einsum('nij,nj->i', map_gains[:, :, :3], sight.scale_arms) - grown
         # A longer focal length moves all corners away from the principal point.
         of_focal = gains @ (sight.observed.corners - self.camera.principal_point).ravel()
-        scales = of_single_error(of_scale, model.marker_size_std) + of_single_error(of_focal, model.focal_length_std)
-        of_map = scales
+        of_scales = np.stack([model.marker_size_std * of_scale, model.focal_length_std * of_focal], axis=-1)
+        of_map = of_scales @ of_scales.T
         if np.any(sight.map_covariances):
-            of_map = scales + self._of_map(map_gains, T_map_camera[:3, 3])
+            of_map += covariance_of(drawn_sum(map_gains, sight.draws))
         covariance = white + of_corners + of_map
         if not np.all(np.isfinite(covariance)):
             return None
@@ -167,22 +162,8 @@ class _JointFit:
         T = retract(T_map_camera, step)
         pose = CameraPose(self.stamp_ns, T, covariance, of_map, ids, rms_px)
         return Location(
-            pose, sight, seen, weights, map_gains, correlations, white, scales, by_corner, self.camera, model
+            pose, sight, seen, weights, map_gains, correlations, white, of_scales, by_corner, self.camera, model
         )
-
-    def _of_map(self, gains: FloatArray, camera_position: FloatArray) -> FloatArray:
-        """Covariance (6, 6) of a camera pose by errors of the map, without its scale.
-
-        By joint draws, where the markers have them; how the errors of the others are correlated is not known.
-        """
-        sight, others = self.sight, ~self.sight.drawn
-        rest = sight.map_covariances - scale_of_map(sight.scale_arms, self.model)
-        if others.any() and not sight.draws.any():
-            return map_of_pose(gains, rest, sight.T_map_marker[:, :3, 3], camera_position)
-        joint = covariance_of(drawn_sum(gains, sight.draws))
-        if not others.any():
-            return joint
-        return bounded_sum(np.stack([joint, correlated_sum(gains[others], positive(rest[others]))]))
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
         """The second solution (4, 4) of the planar ambiguity if the corners do not rule it out, else None."""

@@ -8,17 +8,15 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import (
     arms_of_scale,
-    correlated_sum,
     drawn_sum,
-    DRAWS,
     INCONSISTENT_PX,
-    positive,
+    NO_DRAWS,
     SystematicErrors,
 )
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, linearise
 from thermal_fiducial.core.lens_errors import LensErrors
-from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Observations
 from thermal_fiducial.core.motion_prior import PredictedCamera
@@ -48,9 +46,8 @@ class Sight(Stacked):
     map_covariances: FloatArray
     #: (N, 3) derivative of their positions by the scale of the map [m]
     scale_arms: FloatArray
-    #: (N, 6, K) joint draws of their errors, and which of them (N,) have some or are known exactly
+    #: (N, 6, K) joint draws of their errors
     draws: FloatArray
-    drawn: BoolArray
 
     @staticmethod
     def of(observed: Observations, marker_map: MarkerMap) -> 'Sight':
@@ -71,8 +68,7 @@ class Sight(Stacked):
             sizes,
             covariances,
             np.zeros_like(positions) if given else arms_of_scale(positions, marker_map.anchors),
-            _draws(known),
-            np.array([marker.draws is not None or not marker.covariance.any() for marker in known], dtype=np.bool_),
+            np.array([marker.draws for marker in known]).reshape(-1, *NO_DRAWS.shape),
         )
 
     def reprojected(self, camera: Camera, T_map_camera: FloatArray) -> 'Reprojected':
@@ -112,9 +108,10 @@ class Location:
     map_gains: FloatArray
     #: (4 N, 4 N) correlations of the corners' systematic errors
     correlations: FloatArray
-    #: (6, 6) parts of the covariance: the white one, by noise of the corners, and that by the scales of map and lens
+    #: (6, 6) part of the covariance by noise of the corners, and (6, 2) errors by one standard deviation of the scales,
+    #: of map and lens
     noise: FloatArray
-    of_scale: FloatArray
+    of_scales: FloatArray
     #: (4 N, 6, 2) derivative of the pose by each corner [1/px]
     corner_gains: FloatArray
     camera: Camera
@@ -131,20 +128,11 @@ class Location:
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """The camera as viewpoint of new markers.
-
-        All but its noise is common to all views: as joint draws where the map's errors are, else as the covariance of
-        the best-known marker in view.
-        """
-        pose, sight = self.pose, self.sight
-        if not sight.drawn.all():
-            of_map = sight.map_covariances
-            best = of_map[np.argmin(np.trace(of_map, axis1=1, axis2=2))]
-            relative = self.noise + correlated_sum(self.map_gains, positive(of_map - best))
-            return Viewpoint.known(pose.T_map_camera, relative, positive(pose.covariance - relative))
+        """The camera as viewpoint of new markers: all but its noise is common to all views."""
+        sight = self.sight
         of_lens = LensErrors(sight.observed.corners.reshape(-1, 2), self.camera, self.model)
         draws = drawn_sum(self.corner_gains, of_lens.drawn()) + drawn_sum(self.map_gains, sight.draws)
-        return Viewpoint.known(pose.T_map_camera, self.noise, self.of_scale, draws)
+        return Viewpoint.known(self.pose.T_map_camera, self.noise, draws, self.of_scales)
 
 
 @dataclass(frozen=True)
@@ -220,15 +208,6 @@ class LocatedFrame:
     def left_out(self, location: Location) -> BoolArray:
         """Which of the K known markers (K,) the pose left out, though they were trusted."""
         return self.known.trusted & ~np.isin(self.known.observed.ids, location.sight.observed.ids)
-
-
-def _draws(markers: list[MapMarker]) -> FloatArray:
-    """(N, 6, K) of N markers, zero for those without."""
-    draws = np.zeros((len(markers), 6, DRAWS))
-    for place, marker in enumerate(markers):
-        if marker.draws is not None:
-            draws[place] = marker.draws
-    return draws
 
 
 def squared_distance(pose: CameraPose, predicted: CameraPose) -> float:

@@ -6,6 +6,14 @@ import math
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import (
+    arms_of_scale,
+    assumed_draws,
+    NO_DRAWS,
+    positive,
+    scale_of_map,
+    SystematicErrors,
+)
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.geometry.se3 import apply, quaternion_from_rotation, rigid_alignment
 from thermal_fiducial.core.measurements import CameraPose, MAP_DTYPE
@@ -45,9 +53,8 @@ class MapMarker:
     last_seen_ns: int = 0
     #: False: in quarantine as inconsistent; no pose uses it
     trusted: bool = True
-    #: (6, K) draws of its error, jointly with those of the markers of the same adjustment; None: how it is correlated
-    #: with others is not known. A file has none.
-    draws: FloatArray | None = field(default=None, compare=False, repr=False)
+    #: (6, K) draws of its error but for the scale, jointly with those of the other markers of a mapper; a file has none
+    draws: FloatArray = field(default_factory=lambda: NO_DRAWS, compare=False, repr=False)
 
     def seen(self, stamp_ns: int, error_px: float) -> 'MapMarker':
         """The marker after one more observation; without ``replace``, as this runs for every marker of every frame."""
@@ -94,6 +101,18 @@ class MarkerMap:
                     own, T_map_marker=marker.T_map_marker, covariance=marker.covariance, draws=marker.draws
                 )
         self.revision += 1
+
+    def with_assumed_draws(self, errors: SystematicErrors) -> 'MarkerMap':
+        """The map as from a file: how the errors of its markers are correlated is assumed."""
+        vague = [marker for marker in self.markers.values() if marker.covariance.any()]
+        if not vague:
+            return self.copy()
+        positions = np.stack([marker.T_map_marker[:3, 3] for marker in vague])
+        covariances = np.stack([marker.covariance for marker in vague])
+        covariances = positive(covariances - scale_of_map(arms_of_scale(positions, self.anchors), errors))
+        draws = assumed_draws(positions, covariances)
+        drawn = {marker.id: replace(marker, draws=own) for marker, own in zip(vague, draws, strict=True)}
+        return replace(self, markers=self.markers | drawn)
 
     def geometry(self) -> dict[int, tuple[FloatArray, float]]:
         """Marker ID to (T_map_marker, size): what a detector needs to look for them."""

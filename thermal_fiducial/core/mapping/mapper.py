@@ -19,13 +19,13 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
-from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarkers
+from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers
 from thermal_fiducial.core.mapping.consistency import are_two_that_contradict, Consistency, contradicting, settled
 from thermal_fiducial.core.mapping.corner_bias import CornerBias
 from thermal_fiducial.core.mapping.keyframes import KeyframeStore, VIEWS
 from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
-from thermal_fiducial.core.mapping.map_data import jump, MapperResult, MarkerMap
+from thermal_fiducial.core.mapping.map_data import jump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera
@@ -79,10 +79,10 @@ class MarkerMapper:
         return T_new_old
 
     def _begin(self, marker_map: MarkerMap) -> None:
-        self._initial, self.map = marker_map.copy(), marker_map.copy()
+        self._bias = CornerBias()
+        self._initial, self.map = marker_map.copy(), marker_map.with_assumed_draws(self._errors)
         self._new = NewMarkers(self.config.marker_size, size_overrides(self.config.marker_size_overrides))
         self._consistency = Consistency(self.map.markers)
-        self._bias = CornerBias()
         #: the last pose that nothing contradicted
         self._last: CameraPose | None = None
         self._keyframes = KeyframeStore(self.config.keyframe_budget, self._initial)
@@ -260,7 +260,8 @@ class MarkerMapper:
         """Candidates: new markers that are not in the map yet, by ID."""
         return dict(self._new.candidates)
 
-    def enter(self, stamp_ns: int, candidate: Candidate, T_map_marker: FloatArray, covariance: FloatArray) -> None:
-        """Take a candidate into the map."""
-        del self._new.candidates[candidate.id]
-        self.map.markers[candidate.id] = entry(stamp_ns, candidate, T_map_marker, covariance)
+    def enter(self, marker: MapMarker) -> None:
+        """Take a candidate into the map, as ``marker``."""
+        del self._new.candidates[marker.id]
+        self.map.markers[marker.id] = marker
+        self.map.revision += 1

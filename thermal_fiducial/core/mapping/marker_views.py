@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.error_model import (
-    correlated_sum,
     covariance_of,
     drawn_sum,
     DRAWS,
@@ -20,6 +19,8 @@ from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.types import FloatArray, IntArray
 
+#: Of a camera pose that no scale has moved.
+NO_SCALES: FloatArray = np.zeros((6, 2))
 #: Poses nearer to each other than this [rad] are one pose, and not the two of a planar ambiguity.
 SAME_POSE = np.deg2rad(2.0)
 # A corner that moves faster in the image than this is hardly before the camera at all [px/m, px/rad].
@@ -36,11 +37,10 @@ class Viewpoint:
     T_map_camera: FloatArray
     #: (2, 6, 6) of either, ROS convention: the part that is independent between views
     covariances: FloatArray
-    #: (6, 6) error that all views share (of odometry over a gap): it moves the marker, but leaves no residual
-    common: FloatArray
-    #: (2, 6, K) joint draws of a further such error of either, with which the rest is noise; None: correlations are not
-    #: known
-    draws: FloatArray | None = None
+    #: (2, 6, K) joint draws of either's error that other views share: it moves the marker, but leaves no residual
+    draws: FloatArray
+    #: (6, 2) the same by one standard deviation of the scales, of map and lens
+    scales: FloatArray
 
     @property
     def poses(self) -> FloatArray:
@@ -49,20 +49,20 @@ class Viewpoint:
 
     @classmethod
     def known(
-        cls, T_map_camera: FloatArray, covariance: FloatArray, common: FloatArray, draws: FloatArray | None = None
+        cls, T_map_camera: FloatArray, covariance: FloatArray, draws: FloatArray, scales: FloatArray = NO_SCALES
     ) -> 'Viewpoint':
-        """A unique camera pose (4, 4); covariances (6, 6) of its independent and of its common error."""
-        both = None if draws is None else np.broadcast_to(draws, (2, *draws.shape))
-        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2), common, both)
+        """A unique camera pose (4, 4): covariance (6, 6) of its own error, draws (6, K) of the one that views share."""
+        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2), np.stack([draws] * 2), scales)
 
     @classmethod
     def either(cls, first: 'Viewpoint', second: 'Viewpoint') -> 'Viewpoint':
         """One of two known camera poses."""
-        views = (first, second)
-        T, covariances = np.stack([v.T_map_camera[0] for v in views]), np.stack([v.covariances[0] for v in views])
-        if first.draws is None or second.draws is None:
-            return cls(T, covariances + np.stack([v.common for v in views]), np.zeros((6, 6)))
-        return cls(T, covariances, first.common, np.stack([first.draws[0], second.draws[0]]))
+        return cls(
+            np.stack([first.T_map_camera[0], second.T_map_camera[0]]),
+            np.stack([first.covariances[0], second.covariances[0]]),
+            np.stack([first.draws[0], second.draws[0]]),
+            first.scales,
+        )
 
 
 @dataclass(frozen=True)
@@ -91,32 +91,30 @@ class FittedPoses:
     #: (n, 8, 6) derivatives of the best one's whitened residuals by the poses of camera and marker
     J_camera: FloatArray
     J_marker: FloatArray
-    #: (n, 6, 6) of its cameras, and the part that they share; (n, 6, K) joint draws of what they share besides
+    #: (n, 6, 6), (n, 6, K) and (n, 6, 2) errors of its cameras, as of :class:`Viewpoint`
     camera_covariances: FloatArray
-    common: FloatArray
-    draws: FloatArray | None
+    draws: FloatArray
+    scales: FloatArray
     #: (n, 8, 8) by which residuals became white; (n, 8, 8) noise of the corners [px^2], and errors of the lens there
     W: FloatArray
     corner_noise: FloatArray
     of_lens: LensErrors
 
-    def errors(self, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray | None]:
-        """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error where the cameras' errors have some.
+    def errors(self, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error but for the scales.
 
         The errors are the corners', whose covariance counts ``noise`` times, and those of the cameras' poses.
         """
         white = np.linalg.inv(np.einsum('vri,vrj->ij', self.J_marker, self.J_marker))
         gains = -white @ np.einsum('vri,vrj->vij', self.J_marker, self.J_camera)
-        of_common = correlated_sum(gains, self.common)
-        if self.draws is None:
-            return noise * white + of_common + correlated_sum(gains, self.camera_covariances), None
+        of_scales = drawn_sum(gains, self.scales)
         by_corner = white @ np.swapaxes(self.J_marker, -1, -2) @ self.W
         of_lens = self.of_lens.drawn().reshape(-1, 8, DRAWS)
         shared = drawn_sum(gains, self.draws) + drawn_sum(by_corner, of_lens)
         own = independent_sum(by_corner, self.corner_noise) + independent_sum(gains, self.camera_covariances)
         own *= noise
         of_noise = np.linalg.cholesky(own) @ rng.standard_normal((6, DRAWS))
-        return own + of_common + covariance_of(shared), shared + of_noise
+        return own + of_scales @ of_scales.T + covariance_of(shared), shared + of_noise
 
 
 @dataclass(frozen=True)
@@ -142,17 +140,12 @@ class MarkerViews:
         #: with the bias of the corners, for weights and decisions
         self._uncertain = _of_views(with_corner_errors(covariances, SystematicErrors()))
         self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
-        self._camera_noise = self._covariances = np.stack([view.viewpoint.covariances for view in views])
-        self._common = np.stack([view.viewpoint.common for view in views])
-        draws = [view.viewpoint.draws for view in views if view.viewpoint.draws is not None]
-        self._draws = np.stack(draws) if len(draws) == len(views) else None
-        if self._draws is not None:
-            # Views whose cameras have a larger error in common than others count less.
-            best = np.argmin(np.sum(np.square(self._draws[:, 0]), axis=(1, 2)))
-            self._covariances = self._covariances + covariance_of(self._draws - self._draws[best, 0])
-        elif draws:
-            unknown = [np.zeros((2, 6, 1)) if v.viewpoint.draws is None else v.viewpoint.draws for v in views]
-            self._common = self._common + np.stack([covariance_of(both)[0] for both in unknown])
+        self._camera_noise = np.stack([view.viewpoint.covariances for view in views])
+        self._scales = np.stack([view.viewpoint.scales for view in views])
+        self._draws = np.stack([view.viewpoint.draws for view in views])
+        # Views whose cameras have a larger error in common than others count less.
+        best = np.argmin(np.sum(np.square(self._draws[:, 0]), axis=(1, 2)))
+        self._covariances = self._camera_noise + covariance_of(self._draws - self._draws[best, 0])
         self._doubtful = any(len(view.viewpoint.poses) > 1 for view in views)
 
     def fit(self, starts: FloatArray) -> FittedPoses:
@@ -171,8 +164,8 @@ class MarkerViews:
         W, own = begun.W[best], (np.arange(len(self._corners)), used[best])
         return FittedPoses(
             T[order], chi2[order], cost[order],
-            W @ J_camera[best], W @ J_marker[best], self._camera_noise[own], self._common,
-            None if self._draws is None else self._draws[own], W, self._noise, self._of_lens,
+            W @ J_camera[best], W @ J_marker[best], self._camera_noise[own], self._draws[own], self._scales,
+            W, self._noise, self._of_lens,
         )  # fmt: skip
 
     def _choose(self, T: FloatArray) -> IntArray:

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.error_model import correlated_sum
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
@@ -60,28 +59,3 @@ def test_whitening_makes_the_covariance_a_unit():
     C = A @ np.swapaxes(A, -1, -2) + 0.1 * np.eye(2)
     W = whitening(C)
     np.testing.assert_allclose(W @ C @ np.swapaxes(W, -1, -2), np.broadcast_to(np.eye(2), C.shape), atol=1e-12)
-
-
-@pytest.mark.parametrize('correlation', [-0.9, 0.0, 0.5, 1.0])
-def test_the_bound_holds_for_any_correlation(correlation):
-    rng = np.random.default_rng(3)
-    gains = rng.normal(size=(3, 6, 6))
-    A = rng.normal(size=(3, 6, 6))
-    C = A @ np.swapaxes(A, -1, -2)
-    roots = np.linalg.cholesky(C)
-    bound = correlated_sum(gains, C)
-    joint = np.zeros((6, 6))
-    for i in range(3):
-        for j in range(3):
-            # Cross-covariances of this correlation; three errors of -0.9 to each other cannot be, -0.45 can.
-            rho = 1.0 if i == j else max(correlation, -0.45)
-            joint += rho * gains[i] @ roots[i] @ roots[j].T @ gains[j].T
-    assert np.linalg.eigvalsh(bound - joint)[0] > -1e-9 * np.trace(bound)
-
-
-def test_the_bound_of_one_error_is_its_covariance():
-    rng = np.random.default_rng(4)
-    G, A = rng.normal(size=(2, 1, 6, 6))
-    C = A @ np.swapaxes(A, -1, -2)
-    np.testing.assert_allclose(correlated_sum(G, C), G[0] @ C[0] @ G[0].T)
-    assert not np.any(correlated_sum(G, 0 * C))

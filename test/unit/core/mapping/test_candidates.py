@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.small_bag import CAMERA as STRAIGHT
 
-from thermal_fiducial.core.error_model import covariance_of, DRAWS, SystematicErrors
+from thermal_fiducial.core.error_model import covariance_of, DRAWS, NO_DRAWS, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.candidates import Candidate
@@ -22,7 +22,7 @@ def view(stamp_ns, T_map_camera, covariance=1e-3):
     """A marker seen in the middle of the image, from a camera that may not have seen it there."""
     branch = transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 2.0])
     corners = CAMERA.project((branch[:3, :3] @ marker_corners(SIZE).T).T + branch[:3, 3])
-    viewpoint = Viewpoint.known(T_map_camera, covariance * np.eye(6), np.zeros((6, 6)))
+    viewpoint = Viewpoint.known(T_map_camera, covariance * np.eye(6), NO_DRAWS)
     return MarkerView(stamp_ns, viewpoint, corners, np.tile(1e-4 * np.eye(2), (4, 1, 1)), np.stack([branch] * 2))
 
 
@@ -45,7 +45,7 @@ def seen_from(x, draws):
     T_map_camera = transform(np.eye(3), [x, 0.2, 0.0])
     branch = inverse(T_map_camera) @ T_MAP_MARKER
     corners = CAMERA.project((branch[:3, :3] @ marker_corners(SIZE).T).T + branch[:3, 3])
-    viewpoint = Viewpoint.known(T_map_camera, 1e-8 * np.eye(6), np.zeros((6, 6)), draws)
+    viewpoint = Viewpoint.known(T_map_camera, 1e-8 * np.eye(6), draws)
     return MarkerView(
         round(1e9 * (1.0 + x)), viewpoint, corners, np.tile(1e-4 * np.eye(2), (4, 1, 1)), np.stack([branch] * 2)
     )
@@ -76,18 +76,8 @@ def test_a_new_marker_has_the_errors_of_the_lens_at_its_own_corners():
     assert np.allclose(variances[1], 4.0 * variances[0], rtol=1e-6)
 
 
-def test_where_one_view_has_no_draws_the_errors_count_as_correlated_anyhow():
-    shift = np.zeros((6, DRAWS))
-    shift[:3] = 0.1 * np.random.default_rng(0).normal(size=(3, DRAWS))
-    mixed = placed(shift, shift, None)
-    assert mixed.draws is None
-    # Two of three views that count alike have 4/9 of the variance if their errors are the same, and 2/9 if independent.
-    assert mixed.covariance[:3, :3].trace() > 0.35 * covariance_of(shift)[:3, :3].trace()
-
-
 def test_one_of_two_cameras_has_the_draws_of_each():
     first, second = (seen_from(x, x * np.ones((6, DRAWS))).viewpoint for x in (0.1, 0.2))
     both = Viewpoint.either(first, second)
     assert len(both.poses) == 2
     assert np.array_equal(both.draws[:, 0, 0], [0.1, 0.2])
-    assert Viewpoint.either(first, replace(second, draws=None)).draws is None
