@@ -92,13 +92,12 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
     system = problem.equations.reduced(problem.normal(now, scale)[0])
     if system is None:
         return None
-    of_held = np.stack([snapshot.markers[key].covariance for key in problem.ids])
-    covariances = system.covariances(widened, of_held)
     positions = now.state.T_map_marker[:, :3, 3]
     sources = ErrorSources(problem, system, now, weights, np.random.default_rng(0))
     lasting = sources.lasting(snapshot.errors)
-    covariances += covariance_of(lasting)
-    draws = lasting + sources.noise(widened, np.stack([snapshot.markers[key].draws for key in problem.ids]))
+    of_held = system.by_held(np.stack([snapshot.markers[key].draws for key in problem.ids]))
+    draws = lasting + sources.noise(widened) + of_held
+    covariances = widened * system.covariances() + covariance_of(lasting) + covariance_of(of_held)
     covariances += scale_of_map(arms_of_scale(positions, positions[problem.held]), snapshot.errors)
     if not np.all(np.isfinite(covariances)):
         return None

@@ -4,6 +4,7 @@ Two markers that are seen in the same frames have nearly the same error, which a
 of all markers together do: the error of a pose by several markers is its derivative times theirs, draw by draw.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,8 @@ from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProb
 from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
 from thermal_fiducial.core.types import FloatArray
 
+#: Right sides (F, 6, k) and (M, 6, k) of the normal equations.
+Sides = tuple[FloatArray, FloatArray]
 #: Draws that are propagated at a time, which bounds the memory.
 _AT_ONCE = 32
 
@@ -29,25 +32,19 @@ class ErrorSources:
     weights: FloatArray
     rng: np.random.Generator
 
-    def noise(self, widened: float, of_held: FloatArray) -> FloatArray:
-        """(M, 6, K) by noise of corners and priors, and by the held markers.
-
-        Parameters
-        ----------
-        widened : factor of the variances of corners and priors
-        of_held : (M, 6, K) draws of the held markers, others are not used
-        """
+    def noise(self, widened: float) -> FloatArray:
+        """(M, 6, K) by noise of corners and priors, whose variances count ``widened`` times."""
         problem, roots = self.problem, np.sqrt(widened * self.weights)[:, None, None]
         of_frame, of_marker = (
             np.sqrt(widened) * root_of(priors.information) for priors in (problem.odometry, problem.known)
         )
-        parts = []
-        for _ in range(0, DRAWS, _AT_ONCE):
-            of_frames, of_markers = self._sides(roots * self._normal(len(roots), 8))
+
+        def sides(_: slice) -> Sides:
+            of_frames, of_markers = self._of_residuals(roots * self._normal(len(roots), 8))
             of_frames += of_frame @ self._normal(len(of_frame), 6)
-            of_markers += of_marker @ self._normal(len(of_marker), 6)
-            parts.append(self.system.solve(of_frames, of_markers)[1])
-        return np.concatenate(parts, axis=-1) + self.system.by_held(of_held)
+            return of_frames, of_markers + of_marker @ self._normal(len(of_marker), 6)
+
+        return self._solved(sides)
 
     def lasting(self, errors: SystematicErrors) -> FloatArray:
         """(M, 6, K) by corner errors that are the same in all views of a marker, and by those of the lens.
@@ -56,24 +53,30 @@ class ErrorSources:
         that is wrong bends it.
         """
         problem, weights = self.problem, self.weights[:, None, None]
-        shapes, parts = self._shapes(errors)[:, None, None, None], []
+        shapes = self._shapes(errors)[:, None, None, None]
         views = [problem.camera == index for index in range(len(problem.cameras))]
         lenses = [
             LensErrors(problem.corners[own], camera, errors) for own, camera in zip(views, problem.cameras, strict=True)
         ]
-        for first in range(0, DRAWS, _AT_ONCE):
-            off = (shapes * self.rng.standard_normal((len(shapes), 4, 2, _AT_ONCE)))[problem.marker]
+
+        def sides(chosen: slice) -> Sides:
+            off = (shapes * self._normal(len(shapes), 4, 2))[problem.marker]
             for own, lens in zip(views, lenses, strict=True):
-                off[own] += lens.drawn(slice(first, first + _AT_ONCE))
-            sides = self._sides(weights * (problem.W @ off).reshape(-1, 8, _AT_ONCE))
-            parts.append(self.system.solve(*sides)[1])
-        return np.concatenate(parts, axis=-1)
+                off[own] += lens.drawn(chosen)
+            return self._of_residuals(weights * (problem.W @ off).reshape(-1, 8, _AT_ONCE))
+
+        return self._solved(sides)
+
+    def _solved(self, sides: Callable[[slice], Sides]) -> FloatArray:
+        """Errors (M, 6, K) by right sides of the normal equations, which come for some of the draws at a time."""
+        chosen = (slice(first, first + _AT_ONCE) for first in range(0, DRAWS, _AT_ONCE))
+        return np.concatenate([self.system.solve(*sides(some))[1] for some in chosen], axis=-1)
 
     def _normal(self, *shape: int) -> FloatArray:
         return self.rng.standard_normal((*shape, _AT_ONCE))
 
-    def _sides(self, residuals: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Right sides (F, 6, k) and (M, 6, k) of the normal equations for weighted residuals (n, 8, k)."""
+    def _of_residuals(self, residuals: FloatArray) -> Sides:
+        """Right sides for weighted residuals (n, 8, k)."""
         problem, now = self.problem, self.now
         of_frames = problem.over_frames(np.swapaxes(now.J_camera, -1, -2) @ residuals)
         return of_frames, problem.over_markers(np.swapaxes(now.J_marker, -1, -2) @ residuals)

@@ -98,18 +98,11 @@ class ReducedSystem:
         left = sides - self.coupling @ markers.reshape(-1, count)
         return np.swapaxes(self.root, -1, -2) @ left.reshape(of_frames.shape), markers
 
-    def covariances(self, factor: float, held_covariances: FloatArray) -> FloatArray:
-        """Covariances (M, 6, 6) of the markers: noise times ``factor``, plus those by held markers (M, 6, 6)."""
-        free = np.flatnonzero(~self.held)
-        unknowns = (6 * free[:, None] + np.arange(6)).ravel()
-        result = held_covariances.copy()
-        result[free] = factor * self.factor.covariances()
-        for held in np.flatnonzero(self.held):
-            if np.any(held_covariances[held]):
-                columns = self.matrix[unknowns][:, 6 * held : 6 * held + 6]
-                gains = -self.factor.solve(_as_array(columns)).reshape(-1, 6, 6)
-                result[free] += gains @ held_covariances[held] @ np.swapaxes(gains, -1, -2)
-        return np.asarray(0.5 * (result + np.swapaxes(result, -1, -2)))
+    def covariances(self) -> FloatArray:
+        """Covariances (M, 6, 6) of the markers by noise."""
+        result = np.zeros((len(self.held), 6, 6))
+        result[~self.held] = self.factor.covariances()
+        return 0.5 * (result + np.swapaxes(result, -1, -2))
 
     def by_held(self, drawn: FloatArray) -> FloatArray:
         """Errors (M, 6, K) of all markers by those of the held ones, of ``drawn`` (M, 6, K)."""
@@ -125,10 +118,6 @@ def _damped(H: FloatArray, damping: float) -> FloatArray:
     diagonal = np.einsum('...ii->...i', H)
     floor = SINGULAR * (np.max(diagonal, axis=-1, keepdims=True) + SINGULAR)
     return np.asarray(H + (damping * diagonal + floor)[..., None] * np.eye(6))
-
-
-def _as_array(matrix: Any) -> FloatArray:
-    return np.asarray(matrix if isinstance(matrix, np.ndarray) else matrix.toarray())
 
 
 def _diagonal_blocks(matrix: FloatArray) -> FloatArray:

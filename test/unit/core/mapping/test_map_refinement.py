@@ -8,7 +8,7 @@ import pytest
 from support.walls import CAMERA, flight, see, SIZE, wall
 from support.wrong_lenses import drawn_lens
 
-from thermal_fiducial.core.error_model import covariance_of, NO_SYSTEMATIC_ERRORS, SystematicErrors
+from thermal_fiducial.core.error_model import covariance_of, draws_of, NO_SYSTEMATIC_ERRORS, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
@@ -114,7 +114,7 @@ def test_the_schur_complement_answers_like_the_whole_system():
     # Two ways of solving one system of condition 1e8.
     np.testing.assert_allclose(np.concatenate([frames.ravel(), markers.ravel()]), expected, rtol=1e-5, atol=1e-9)
     inverse_H = np.linalg.inv(H[np.ix_(free, free)])
-    covariances = system.covariances(1.0, np.zeros((M, 6, 6)))
+    covariances = system.covariances()
     for k, m in enumerate(np.flatnonzero(~problem.held)):
         own = slice(6 * (F + k), 6 * (F + k) + 6)
         np.testing.assert_allclose(covariances[m], inverse_H[own, own], rtol=1e-4, atol=1e-15)
@@ -159,7 +159,8 @@ def test_the_covariance_of_a_fixed_marker_enters_that_of_the_others():
     poses = wall(rng)
     s = snapshot(rng, poses)
     survey = np.diag([1e-4, 2e-4, 3e-4, 0.0, 0.0, 0.0])
-    unsure = replace(s, markers={**s.markers, 0: replace(s.markers[0], covariance=survey)})
+    draws = draws_of(survey, np.random.default_rng(0))
+    unsure = replace(s, markers={**s.markers, 0: replace(s.markers[0], covariance=survey, draws=draws)})
     sharp, blurred = refine(s), refine(unsure)
     assert sharp is not None
     assert blurred is not None
