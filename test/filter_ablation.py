@@ -16,7 +16,7 @@ from support.filter_scenes import Figures, SCENES
 from support.taken_out import ablation_row, lines_of
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.pose_noise import WHITE
+from thermal_fiducial.core.filter.pose_noise import LIMITS, WHITE
 from thermal_fiducial.core.filter.update import body_pose
 
 FILTER = 'thermal_fiducial.core.filter'
@@ -59,6 +59,13 @@ def _with_the_map(pose: Any, T_body_camera: Any, scale: float) -> Any:
     return body_pose(replace(pose, map_covariance=np.zeros((6, 6))), T_body_camera, scale)
 
 
+def _limits_with(place: int, value: float) -> Any:
+    """Limits of the white errors' variances, with one of them fixed."""
+    limits = LIMITS.copy()
+    limits[:, place] = value
+    return limits
+
+
 MECHANISMS = {
     'systematic error of poses': Mechanism(('lasting errors',), changes={'systematic_pose_std': 0.01}),
     'error of the map apart': Mechanism(
@@ -76,12 +83,12 @@ MECHANISMS = {
     ),
     'size of white errors is learned': Mechanism(
         ('noise of poses', 'lasting errors'),
-        off={'pose_noise:_WHITE_RANGE': (WHITE, WHITE)},
+        off={'pose_noise:LIMITS': _limits_with(0, WHITE)},
     ),
     'jitter of stamps': Mechanism(('jittering',), changes={'stamp_jitter': 0.0}),
     'jitter is learned': Mechanism(
         ('jittering',),
-        off={'pose_noise:_JITTER_RANGE': (PoseEkfConfig().stamp_jitter ** 2,) * 2},
+        off={'pose_noise:LIMITS': _limits_with(1, PoseEkfConfig().stamp_jitter ** 2)},
     ),
     'vibration of the mount': Mechanism(('shaking mount',), ('update:by_mount',), changes={'mount_vibration': 0.0}),
     'scale of the gyroscope': Mechanism(('scale errors',), changes={'gyroscope_scale_std': 0.0}),

@@ -79,7 +79,7 @@ def start(
     noise = PoseNoise.of(pose, config.stamp_jitter, config.mount_vibration)
     P = np.diag(_initial_variances(config))
     P[SYSTEMATIC, SYSTEMATIC] = config.systematic_pose_std**2 * pose.shape
-    P[np.ix_(POSE, POSE)] += noise.white.value * pose.shape
+    P[np.ix_(POSE, POSE)] += noise.variances[0] * pose.shape
     # What the pose is wrong by lastingly is an error of the estimate, with the opposite sign.
     for place in (SYSTEMATIC, EXTRINSICS):
         lasting = P[place, place]

@@ -155,13 +155,14 @@ def figures_of(history: History, main: Hypothesis, T_map_first: FloatArray, grav
 
     ``T_map_first`` (4, 4): the map that it is in, in the present one; ``gravity``: its size.
     """
-    state, noise = main.estimate.state.in_moved_map(T_map_first), main.estimate.pose_noise
+    state = main.estimate.state.in_moved_map(T_map_first)
+    white, jitter, vibration = main.estimate.pose_noise.stds
     return {
         'seconds since accepted pose': coasting_seconds(history, main),
         'position std': main.estimate.position_std,
-        'white pose error': math.sqrt(noise.white.value),
-        'stamp jitter': math.sqrt(noise.jitter.value),
-        'mount vibration': math.sqrt(noise.vibration.value),
+        'white pose error': white,
+        'stamp jitter': jitter,
+        'mount vibration': vibration,
         'gyroscope bias': float(np.linalg.norm(state.bias[:3])),
         'accelerometer bias': float(np.linalg.norm(state.bias[3:])),
         'gyroscope scale error': float(np.abs(state.scale[0]).max()),

@@ -11,22 +11,21 @@ Source: R. Mehra, "Approaches to Adaptive Filtering", IEEE TAC 1972.
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.types import FloatArray
 
-#: Variances of white errors at least and at most, and the memory [poses] with which they are learned. Of a pose's own
-#: covariance: the systematic error has all of it besides; with half of it the fused pose before a recorded board claims
-#: less than its error. Poses that claim too little must not be refused for long.
+#: Least white variance of a pose as a multiple of its own covariance: the systematic error has all of it besides; with
+#: half of it the fused pose before a recorded board claims less than its error.
 WHITE = 0.5
-_WHITE_RANGE, _WHITE_MEMORY = (WHITE, 30.0 * WHITE), 10.0
 #: The same before anything is learned: the white error may be all that a pose claims.
 _WHITE_AT_FIRST = 1.0
-#: Of the jitter of stamps [s^2] and of the mount's vibration [rad^2].
-_JITTER_RANGE, _VIBRATION_RANGE, _MEMORY = (1e-8, 2.5e-5), (1e-10, 1e-4), 300.0
+#: Least and largest values of the three variances of :class:`PoseNoise`, and the memory [poses] with which they are
+#: learned: poses that claim too little must not be refused for long.
+LIMITS = np.array(((WHITE, 1e-8, 1e-10), (30.0 * WHITE, 2.5e-5, 1e-4)))
+_MEMORY = np.array((10.0, 300.0, 300.0))
 #: Weight of the initial values, as information about their logarithms; limit of the normalised squared innovation.
 _PRIOR, _LARGEST_SQUARE = 5.0, 9.0
 #: Least share of the variance of a component that the others leave unexplained.
@@ -124,60 +123,17 @@ def share_that_stays(earlier: FloatArray, claimed: FloatArray) -> FloatArray:
     return np.asarray((from_units @ axes / np.maximum(variances, 1.0)) @ axes.T @ to_units)
 
 
-class LearnedVariance(NamedTuple):
-    """Variance of a white error that is learned from innovations, 0 for none.
-
-    Attributes
-    ----------
-    limits : least and largest value
-    memory : [poses]
-    information : about its logarithm
-    """
-
-    value: float
-    limits: tuple[float, float]
-    memory: float
-    information: float = 0.0
-
-    def adapted(self, unit: FloatArray, change: FloatArray, S_inverse: FloatArray) -> 'LearnedVariance':
-        """One step of Fisher scoring on the likelihood of an innovation's ``change`` (6,).
-
-        Parameters
-        ----------
-        unit : (6, 6) covariance of the innovation by a variance of 1
-        S_inverse : (6, 6) of the innovation's covariance
-        """
-        if not self.value:
-            return self
-        share = self.value * (S_inverse @ unit)
-        expected, weighted = float(share.trace()), S_inverse @ change
-        square = min(self.value * float(weighted @ unit @ weighted), _LARGEST_SQUARE * expected)
-        information = (1.0 - 1.0 / self.memory) * self.information + 0.5 * float(np.sum(share * share.T))
-        value = self.value * math.exp(0.5 * (square - expected) / (_PRIOR + information))
-        least, largest = self.limits
-        return self._replace(value=min(max(value, least), largest), information=information)
-
-
-class WhiteUnits(NamedTuple):
-    """Covariances (6, 6) of an innovation by white errors of variance 1, as of :class:`PoseNoise`."""
-
-    white: FloatArray
-    jitter: FloatArray
-    vibration: FloatArray
-
-
 @dataclass(frozen=True, slots=True)
 class PoseNoise:
     """Variances of the camera poses' white errors, as adapted to the innovations."""
 
     #: the last accepted pose
     last: BodyPose
-    #: as a multiple of the poses' own covariance
-    white: LearnedVariance
-    #: of the camera's stamps [s^2]
-    jitter: LearnedVariance
-    #: of the camera's rotation against the IMU, about each axis [rad^2]
-    vibration: LearnedVariance
+    #: (3,) as a multiple of the poses' own covariance; of the camera's stamps [s^2]; of the camera's rotation against
+    #: the IMU, about each axis [rad^2]. 0 for none
+    variances: FloatArray
+    #: (3,) about the logarithms of the variances
+    information: FloatArray = field(default_factory=lambda: np.zeros(3))
     #: (6,) of the last pose that was compared with the estimate, accepted or not, and its covariance (6, 6)
     innovation: FloatArray = field(default_factory=lambda: np.zeros(6))
     S: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
@@ -185,21 +141,20 @@ class PoseNoise:
     @classmethod
     def of(cls, first: BodyPose, stamp_jitter: float = 0.0, mount_vibration: float = 0.0) -> 'PoseNoise':
         """Initial values; ``stamp_jitter`` [s] and ``mount_vibration`` [rad] are standard deviations."""
-        return cls(
-            first,
-            LearnedVariance(_WHITE_AT_FIRST, _WHITE_RANGE, _WHITE_MEMORY),
-            LearnedVariance(stamp_jitter**2, _JITTER_RANGE, _MEMORY),
-            LearnedVariance(mount_vibration**2, _VIBRATION_RANGE, _MEMORY),
-        )
+        return cls(first, np.array((_WHITE_AT_FIRST, stamp_jitter**2, mount_vibration**2)))
 
-    def covariance(self, units: WhiteUnits) -> FloatArray:
-        """Covariance (6, 6) of an innovation by white errors."""
-        return (
-            self.white.value * units.white + self.jitter.value * units.jitter + self.vibration.value * units.vibration
-        )
+    @property
+    def stds(self) -> list[float]:
+        """Roots of the variances [1, s, rad]."""
+        stds: list[float] = np.sqrt(self.variances).tolist()
+        return stds
 
-    def adapted(self, units: WhiteUnits, innovation: FloatArray, S: FloatArray) -> 'PoseNoise':
-        """Adapt the variances to the change of the innovation since the last pose.
+    def covariance(self, units: FloatArray) -> FloatArray:
+        """Covariance (6, 6) of an innovation by white errors; ``units`` (3, 6, 6) are those by variances of 1."""
+        return np.asarray((self.variances[:, None, None] * units).sum(axis=0))
+
+    def adapted(self, units: FloatArray, innovation: FloatArray, S: FloatArray) -> 'PoseNoise':
+        """Adapt the variances to the change of the innovation since the last pose: one step of Fisher scoring.
 
         The change does not contain what stays, as a step of the clock or a moved marker. Innovations of a filter are
         independent, so the covariance of the change is the sum of theirs: the first ones, of a robot whose velocity is
@@ -207,16 +162,17 @@ class PoseNoise:
 
         Parameters
         ----------
+        units : (3, 6, 6) covariances of an innovation by variances of 1
         innovation, S : (6,) and its covariance (6, 6)
         """
         # Scaled to the variance of one white innovation.
         change = (innovation - self.innovation) / math.sqrt(2.0)
-        inverse = np.asarray(np.linalg.inv(0.5 * (S + self.S)))
-        return replace(
-            self,
-            white=self.white.adapted(units.white, change, inverse),
-            jitter=self.jitter.adapted(units.jitter, change, inverse),
-            vibration=self.vibration.adapted(units.vibration, change, inverse),
-            innovation=innovation,
-            S=S,
-        )
+        inverse = np.linalg.inv(0.5 * (S + self.S))
+        shares = inverse @ (self.variances[:, None, None] * units)
+        expected = shares.trace(axis1=1, axis2=2)
+        squares = np.minimum(change @ shares @ (inverse @ change), _LARGEST_SQUARE * expected)
+        fresh = 0.5 * (shares * shares.swapaxes(1, 2)).sum(axis=(1, 2))
+        information = (1.0 - 1.0 / _MEMORY) * self.information + fresh
+        learned = self.variances * np.exp(0.5 * (squares - expected) / (_PRIOR + information))
+        bounded = np.where(self.variances > 0.0, np.clip(learned, *LIMITS), 0.0)
+        return replace(self, variances=bounded, information=information, innovation=innovation, S=S)

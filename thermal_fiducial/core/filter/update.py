@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
-from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_that_stays, WhiteUnits
+from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_that_stays
 from thermal_fiducial.core.filter.state import (
     CORE,
     Estimate,
@@ -47,7 +47,8 @@ class Innovation(NamedTuple):
     prior: Estimate
     #: time derivative (9,) of the prior's core error coordinates
     derivative: FloatArray
-    units: WhiteUnits
+    #: (3, 6, 6) covariances of the innovation by white errors of variance 1, in the order of :class:`PoseNoise`
+    units: FloatArray
     #: (6,) the innovation, its covariance S (6, 6) and the inverse, Jacobian H (6, 48), measurement noise R (6, 6)
     value: FloatArray
     S: FloatArray
@@ -103,13 +104,15 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
     H = np.zeros((6, SIZE))
     H[_SIX, POSE] = 1.0
     H[:, EXTRINSICS] = H[:, SYSTEMATIC] = np.eye(6)
-    units = _white_units(prior, pose, derivative)
+    mount = by_mount(prior.state)
+    jitter = np.outer(derivative[POSE], derivative[POSE])
+    units = np.stack((pose.shape, jitter, mount @ mount.T))
     R = prior.pose_noise.covariance(units)
     if config.estimate_time_offset:
         H[:, TIME_OFFSET] = derivative[POSE]
         R += _second_order_of_clock(prior, motion, derivative)
     else:
-        R += config.time_offset_std**2 * units.jitter
+        R += config.time_offset_std**2 * jitter
     value = pose_error(prior.state, pose.T_map_body) - prior.state.systematic
     S = H @ prior.covariance @ H.T + R
     S_inverse = np.asarray(np.linalg.inv(S))
@@ -168,11 +171,6 @@ def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estim
     P[SYSTEMATIC, SYSTEMATIC] += other_map * pose.of_map
     state = replace(estimate.state, systematic=kept @ estimate.state.systematic)
     return replace(estimate, state=state, covariance=P)
-
-
-def _white_units(prior: Estimate, pose: BodyPose, derivative: FloatArray) -> WhiteUnits:
-    twist, mount = derivative[POSE], by_mount(prior.state)
-    return WhiteUnits(pose.shape, np.outer(twist, twist), mount @ mount.T)
 
 
 def _second_order_of_clock(prior: Estimate, motion: MotionAtPose, derivative: FloatArray) -> FloatArray:

@@ -187,7 +187,7 @@ def test_an_uncertain_time_offset_adds_noise_by_the_acceleration(estimate, turni
     motion = motion_of(resting.state, np.zeros(3), np.array([push, 0.0, 0.0]), turning=turning)
     pose = BodyPose(resting.state.T_map_body, np.zeros((6, 6)))
     innovation = innovation_of(FULL, resting, pose, motion)
-    expected = 0.75 * std**4 * np.repeat((turning**2, push**2), 3) + resting.pose_noise.white.value * np.diag(
+    expected = 0.75 * std**4 * np.repeat((turning**2, push**2), 3) + resting.pose_noise.variances[0] * np.diag(
         pose.shape
     )
     np.testing.assert_allclose(np.diag(innovation.R), expected, rtol=1e-9)
@@ -203,7 +203,7 @@ def learned_white(estimate, still, errors):
         pose = BodyPose(T, R)
         innovation = innovation_of(parameters, now, pose, still)
         now = replace(now, pose_noise=replace(adapted_noise(innovation), last=pose))
-    return now.pose_noise.white.value
+    return now.pose_noise.variances[0]
 
 
 def test_white_noise_of_poses_is_learned(estimate, still):
@@ -221,7 +221,7 @@ def test_innovations_of_an_unknown_velocity_are_no_noise(estimate, still):
     R = innovation_of(parameters, replace(known_well, pose_noise=noise), pose, still)
     first = noise.adapted(R.units, far, R.S + np.diag(far**2))
     second = first.adapted(R.units, np.zeros(6), R.S)
-    assert max(first.white.value, second.white.value) <= noise.white.value
+    assert max(first.variances[0], second.variances[0]) <= noise.variances[0]
 
 
 def test_poses_with_less_noise_than_claimed_keep_their_covariance(estimate, still):
@@ -367,7 +367,7 @@ def test_jitter_of_the_stamps_is_learned(estimate, motion, accepted):
         innovation = innovation_of(white, now, pose, motion)
         noise = corrected(white, innovation).pose_noise if accepted else adapted_noise(innovation)
     # the memory of 300 poses of one number: 6 % of the deviation; three of that
-    assert np.sqrt(noise.jitter.value) == pytest.approx(3e-3, rel=0.18)
+    assert np.sqrt(noise.variances[1]) == pytest.approx(3e-3, rel=0.18)
 
 
 def test_a_rotation_of_the_camera_against_the_robot_moves_the_pose_as_its_noise_says(estimate):
@@ -390,7 +390,7 @@ def test_vibration_of_the_mount_is_learned(estimate, still, accepted):
         innovation = innovation_of(parameters, replace(known(estimate, 1e-14), pose_noise=noise), pose, still)
         noise = corrected(parameters, innovation).pose_noise if accepted else adapted_noise(innovation)
     # The memory of 300 poses of three numbers: 3 % of the deviation; the limit of squares takes some. Three of that.
-    assert np.sqrt(noise.vibration.value) == pytest.approx(2e-3, rel=0.1)
+    assert np.sqrt(noise.variances[2]) == pytest.approx(2e-3, rel=0.1)
 
 
 def test_a_step_of_the_clock_of_the_imu_does_not_show_in_the_next_pose(estimate, motion):
