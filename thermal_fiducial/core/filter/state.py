@@ -156,7 +156,7 @@ class Estimate:
 
     def std(self, place: slice | int) -> float:
         """Root of the sum of the variances of some coordinates: relative to the map, as poses show them."""
-        return math.sqrt(float(np.sum(self.covariance.diagonal()[place])))
+        return math.sqrt(float(self.covariance.diagonal()[place].sum()))
 
     @property
     def position_std(self) -> float:

@@ -49,7 +49,7 @@ class FilterMemory:
 
     def refusal(self, filter_: PoseEkf, pose: CameraPose) -> PoseUpdate | None:
         """The refusal of an initial pose that contradicts the saved one; None if it does not."""
-        if self._hint is None or filter_.state is not None:
+        if self._hint is None or filter_.estimate is not None:
             return None
         distance = self._hint.contradiction(pose)
         reason = f'refused: {distance:.1f} m from the last pose before the restart'
@@ -63,10 +63,11 @@ class FilterMemory:
         InputError
             The file cannot be written; raised once.
         """
-        if not self._active or filter_.lost or filter_.state is None:
+        state = filter_.state
+        if not self._active or filter_.lost or state is None:
             return
         self._active = False
-        save_last_pose(self._path, LastPose(stamp_ns, filter_.state.T_map_body, filter_.camera_time_offset))
+        save_last_pose(self._path, LastPose(stamp_ns, state.T_map_body, filter_.camera_time_offset))
         self._active = True
 
     def _close(self) -> None:

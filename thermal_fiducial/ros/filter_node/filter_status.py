@@ -35,7 +35,7 @@ class FilterStatus:
     def after_imu(self, stamp_ns: int) -> None:
         """Count a start or a reset."""
         self._imu_ns = stamp_ns
-        resets = None if self._filter.state is None else self._filter.resets
+        resets = None if self._filter.estimate is None else self._filter.resets
         if resets == self._resets:
             return
         self.jumps += resets is not None
