@@ -25,8 +25,8 @@ class SystematicErrors:
     #: Corners [px]: model of the lens and bias of the detector, which last as long as the view. To begin with what a
     #: published calibration leaves of a board of 36 tags (means over cells of 60 px: 0.08 and 0.09 px; body poses from
     #: two cameras differ by 6.6 mm, NEES 2.4 without it, 0.9 with it, correlation 0.86 after 0.1 s, 0.36 after 4 s);
-    #: learned in flight from residuals that last (``CornerBias``). Enters poses from markers (:func:`corners_of_pose`);
-    #: map and new markers by draws (``lens_errors``).
+    #: learned in flight from residuals that last (``CornerBias``). Enters poses from markers, map and new markers
+    #: (``LensErrors``).
     corner_px: float = 0.1
     #: Distance over which that error stays the same [share of the image's width]: a lens model is wrong by a smooth
     #: function. On the same board lengths of 0.1 to 0.25 fit, 0.5 leaves NEES 1.1, 1.0 leaves 1.25.
@@ -95,32 +95,6 @@ def noise_factor(chi2: float, freedom: int) -> float:
     freedom : number of residuals less the number of estimated parameters
     """
     return max(1.0, chi2 / max(freedom, 1))
-
-
-def corner_correlations(corners: FloatArray, width: int, errors: SystematicErrors) -> FloatArray:
-    """Correlations (n, n) of the systematic errors of n corners, the same for either axis.
-
-    Parameters
-    ----------
-    corners : (n, 2) [px]
-    width : of the image [px]
-    """
-    u, v = corners[:, 0], corners[:, 1]
-    squared = (u[:, None] - u) ** 2 + (v[:, None] - v) ** 2
-    return np.asarray(np.exp(squared * (-0.5 / (errors.corner_length * width) ** 2)))
-
-
-def corners_of_pose(gains: FloatArray, correlations: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Covariance (m, m) of a pose by the systematic errors of n corners.
-
-    Parameters
-    ----------
-    gains : (n, m, 2) derivative of the pose by each corner [1/px]
-    correlations : (n, n) of the errors
-    """
-    n, m, _ = gains.shape
-    mixed = (correlations @ gains.reshape(n, 2 * m)).reshape(n, m, 2)
-    return np.asarray(errors.corner_px**2 * np.tensordot(gains, mixed, axes=([0, 2], [0, 2])))
 
 
 def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:

@@ -1,7 +1,7 @@
-"""Errors of a lens model as joint draws: a smooth function of the place in the image, the same in all frames.
+"""Errors of a lens model: a smooth function of the place in the image, the same in all frames.
 
-A Gaussian process with the squared exponential covariance of ``error_model.corner_correlations``, by its values at
-nodes over the image (J. Quinonero-Candela, C. Rasmussen, "A Unifying View of Sparse Approximate Gaussian Process
+A Gaussian process with a squared exponential covariance, the same for either axis, by its values at nodes over the
+image (J. Quinonero-Candela, C. Rasmussen, "A Unifying View of Sparse Approximate Gaussian Process
 Regression", JMLR 2005). Poses and maps from one camera have errors of the same draws, wherever these are needed.
 """
 
@@ -21,7 +21,7 @@ _LEAST_INDEPENDENT = 1e-6
 
 
 class LensErrors:
-    """Errors of the lens model at corners (..., 2) [px].
+    """Errors of the lens model at n corners (..., 2) [px].
 
     Parameters
     ----------
@@ -33,12 +33,19 @@ class LensErrors:
         columns, rows = (
             _modes(corners[..., axis], size, length) for axis, size in ((0, camera.width), (1, camera.height))
         )
-        self._modes = errors.corner_px * (columns[..., :, None] * rows[..., None, :]).reshape(*corners.shape[:-1], -1)
-        self._variables = _variables(crc32(np.ascontiguousarray(camera.K).tobytes()), self._modes.shape[-1])
+        #: (..., I) factors of independent variables of variance one, for errors of 1 px
+        self.modes: FloatArray = (columns[..., :, None] * rows[..., None, :]).reshape(*corners.shape[:-1], -1)
+        self._px, self._camera = errors.corner_px, camera
+
+    def covariance(self, gains: FloatArray) -> FloatArray:
+        """Covariance (m, m) of what has derivatives ``gains`` (n, m, 2) [1/px] by the corners."""
+        mixed = np.tensordot(self.modes.reshape(len(gains), -1), self._px * gains, axes=([0], [0]))
+        return np.asarray(np.tensordot(mixed, mixed, axes=([0, 2], [0, 2])))
 
     def drawn(self, chosen: slice = slice(None)) -> FloatArray:
         """The errors (..., 2, k) [px] in the ``chosen`` ones of :data:`DRAWS` draws."""
-        return np.asarray(np.tensordot(self._modes, self._variables[..., chosen], axes=1))
+        variables = _variables(crc32(np.ascontiguousarray(self._camera.K).tobytes()), self.modes.shape[-1])
+        return np.asarray(np.tensordot(self.modes, self._px * variables[..., chosen], axes=1))
 
 
 def _modes(places: FloatArray, size: int, length: float) -> FloatArray:

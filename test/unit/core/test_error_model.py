@@ -10,8 +10,6 @@ from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import (
     arms_of_scale,
     assumed_draws,
-    corner_correlations,
-    corners_of_pose,
     covariance_of,
     drawn_sum,
     DRAWS,
@@ -31,7 +29,8 @@ ERRORS = SystematicErrors()
 
 def root_of_field(corners, errors):
     """(n, n) root of the covariance of the errors of corners (n, 2), of either axis [px]."""
-    correlations = corner_correlations(corners, CAMERA.width, errors)
+    squared = np.sum((corners[:, None] - corners) ** 2, axis=-1)
+    correlations = np.exp(-0.5 * squared / (errors.corner_length * CAMERA.width) ** 2)
     return errors.corner_px * np.linalg.cholesky(correlations + 1e-7 * np.eye(len(corners)))
 
 
@@ -179,8 +178,6 @@ def test_the_scale_of_a_map_moves_the_camera_as_one():
 def test_a_model_without_errors_adds_nothing():
     scale = scale_of_map(np.ones((2, 3)), NO_SYSTEMATIC_ERRORS)
     assert not np.any(scale)
-    alike = corner_correlations(np.ones((3, 2)), 640, ERRORS)
-    assert not np.any(corners_of_pose(np.ones((3, 6, 2)), alike, replace(ERRORS, corner_px=0.0)))
 
 
 # Without a field the estimate falls from its start at 0.1 px, and is within the bound of none after 450 frames; after

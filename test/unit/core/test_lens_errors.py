@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 from support.walls import CAMERA
 
-from thermal_fiducial.core.error_model import corner_correlations, covariance_of, DRAWS, SystematicErrors
+from thermal_fiducial.core.error_model import covariance_of, DRAWS, SystematicErrors
 from thermal_fiducial.core.lens_errors import LensErrors
 
 ERRORS = SystematicErrors(corner_px=0.2)
+
+
+def correlations(corners, length):
+    """(n, n) of the errors of corners (n, 2), by the squared exponential that the process is declared to have."""
+    squared = np.sum((corners[:, None] - corners) ** 2, axis=-1)
+    return np.exp(-0.5 * squared / length**2)
 
 
 @pytest.mark.parametrize(('width', 'height'), [(640, 512), (160, 120), (576, 576)])
@@ -17,13 +23,25 @@ def test_draws_have_the_covariance_of_the_error_model(width, height):
     camera = replace(CAMERA, width=width, height=height)
     corners = np.random.default_rng(0).uniform(0.0, [width, height], (40, 2))
     draws = LensErrors(corners, camera, ERRORS).drawn()
-    expected = ERRORS.corner_px**2 * corner_correlations(corners, width, ERRORS)
+    expected = ERRORS.corner_px**2 * correlations(corners, 0.25 * width)
     modes = 2 * 6 * (2 + int(height / (0.25 * width)))
     # Between nodes one length apart the process is known to 1 to 2 %. Draws for more modes than there are draws are not
     # quite uncorrelated: four standard deviations, of directions of 64 out of that many dimensions.
     tolerance = 0.03 + 4.0 * np.sqrt(max(1.0 / DRAWS - 1.0 / modes, 0.0))
     for axis in (0, 1):
         assert np.abs(covariance_of(draws[:, axis]) - expected).max() < tolerance * ERRORS.corner_px**2
+
+
+@pytest.mark.parametrize(('width', 'height'), [(640, 512), (160, 120), (576, 576)])
+def test_a_sum_of_errors_has_their_covariance(width, height):
+    rng, camera = np.random.default_rng(1), replace(CAMERA, width=width, height=height)
+    corners, gains = rng.uniform(0.0, [width, height], (40, 2)), rng.normal(size=(40, 6, 2))
+    expected = ERRORS.corner_px**2 * np.einsum('iau,ij,jbu->ab', gains, correlations(corners, 0.25 * width), gains)
+    found = LensErrors(corners, camera, ERRORS).covariance(gains)
+    # Between nodes one length apart the process is known to 1 to 2 %.
+    assert np.abs(found - expected).max() < 0.02 * expected.max()
+    nothing = LensErrors(corners, camera, replace(ERRORS, corner_px=0.0))
+    assert not nothing.covariance(gains).any()
 
 
 def test_a_camera_has_one_lens():

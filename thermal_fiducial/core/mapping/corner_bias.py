@@ -65,11 +65,11 @@ class CornerBias:
         # Residuals of moved or mistaken markers are correlated too.
         limit = min(INCONSISTENT_PX, BIAS_OUTLIER * self.px) ** 2
         bound = np.minimum(1.0, limit / np.maximum(np.abs(products), TINY))
-        corners = np.repeat(np.isin(np.arange(len(noise)), now), 4)
         weights, scale = (np.repeat(np.sqrt(values), 4)[:, None] for values in (shares, shares * bound))
+        modes = weights * location.lens.modes[now].reshape(len(weights), -1)
         shown = shown_errors(
             weights[..., None] * location.seen.J_camera[now].reshape(-1, 2, 6),
-            weights * location.correlations[corners][:, corners] * weights.T,
+            modes @ modes.T,
             scale * residuals.reshape(-1, 2),
             scale * former.reshape(-1, 2),
         )

@@ -10,8 +10,6 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.error_model import (
-    corner_correlations,
-    corners_of_pose,
     covariance_of,
     decision_weights,
     drawn_sum,
@@ -25,6 +23,7 @@ from thermal_fiducial.core.geometry.camera import Camera, inverse_2x2
 from thermal_fiducial.core.geometry.planar_pose import CameraFit, INLIER
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
+from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.located import Location, Refusal, Reprojected, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
 from thermal_fiducial.core.measurements import CameraPose
@@ -142,8 +141,7 @@ class _JointFit:
         n, sight, model = len(weights), self.sight, self.model
         by_corner = np.swapaxes(gains.reshape(6, 4 * n, 2), 0, 1)
         white = noise_of_pose(by_corner, sight.observed.covariances.reshape(-1, 2, 2), chi2)
-        correlations = corner_correlations(sight.observed.corners.reshape(-1, 2), self.camera.width, model)
-        of_corners = corners_of_pose(by_corner, correlations, model)
+        lens = LensErrors(sight.observed.corners, self.camera, model)
         arms = sight.points - sight.T_map_marker[:, None, :3, 3]
         grown = gains @ (seen.J_marker.reshape(n, 4, 2, 6)[..., :3] @ arms[..., None]).ravel()
         map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ seen.J_marker
@@ -155,15 +153,13 @@ class _JointFit:
         of_map = of_scales @ of_scales.T
         if np.any(sight.map_covariances):
             of_map += covariance_of(drawn_sum(map_gains, sight.draws))
-        covariance = white + of_corners + of_map
+        covariance = white + lens.covariance(by_corner) + of_map
         if not np.all(np.isfinite(covariance)):
             return None
         ids, rms_px = tuple(sight.observed.ids.tolist()), math.sqrt(seen.errors_px @ seen.errors_px / n)
         T = retract(T_map_camera, step)
         pose = CameraPose(self.stamp_ns, T, covariance, of_map, ids, rms_px)
-        return Location(
-            pose, sight, seen, weights, map_gains, correlations, white, of_scales, by_corner, self.camera, model
-        )
+        return Location(pose, sight, seen, weights, map_gains, lens, white, of_scales, by_corner)
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
         """The second solution (4, 4) of the planar ambiguity if the corners do not rule it out, else None."""

@@ -9,9 +9,9 @@ import numpy as np
 from thermal_fiducial.core.error_model import (
     arms_of_scale,
     drawn_sum,
+    DRAWS,
     INCONSISTENT_PX,
     NO_DRAWS,
-    SystematicErrors,
 )
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, linearise
@@ -106,16 +106,14 @@ class Location:
     weights: FloatArray
     #: (N, 6, 6) derivative of the pose by the poses of the markers in the map
     map_gains: FloatArray
-    #: (4 N, 4 N) correlations of the corners' systematic errors
-    correlations: FloatArray
+    #: errors of the lens at the corners (N, 4)
+    lens: LensErrors
     #: (6, 6) part of the covariance by noise of the corners, and (6, 2) errors by one standard deviation of the scales,
     #: of map and lens
     noise: FloatArray
     of_scales: FloatArray
     #: (4 N, 6, 2) derivative of the pose by each corner [1/px]
     corner_gains: FloatArray
-    camera: Camera
-    model: SystematicErrors
 
     @cached_property
     def reason(self) -> str:
@@ -129,9 +127,8 @@ class Location:
     @property
     def viewpoint(self) -> Viewpoint:
         """The camera as viewpoint of new markers: all but its noise is common to all views."""
-        sight = self.sight
-        of_lens = LensErrors(sight.observed.corners.reshape(-1, 2), self.camera, self.model)
-        draws = drawn_sum(self.corner_gains, of_lens.drawn()) + drawn_sum(self.map_gains, sight.draws)
+        of_corners = self.lens.drawn().reshape(-1, 2, DRAWS)
+        draws = drawn_sum(self.corner_gains, of_corners) + drawn_sum(self.map_gains, self.sight.draws)
         return Viewpoint.known(self.pose.T_map_camera, self.noise, draws, self.of_scales)
 
 
