@@ -104,7 +104,7 @@ MECHANISMS = {
     ),
     'joint draws of the map': Mechanism(
         ('bent corridor', 'wall', 'uneven map'),
-        ('error_sources:ErrorSources.noise',),
+        ('error_sources:ErrorSources._noise', 'error_sources:ErrorSources._solved'),
         {'localization:drawn_sum': _independent},
     ),
     'priors': Mechanism(

@@ -103,10 +103,6 @@ class Linearised:
     marker_apart: FloatArray
     marker_chi2: FloatArray
 
-    def of_views(self, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """Residuals and derivatives with respect to the markers of the views ``chosen`` (n,)."""
-        return self.r[chosen], self.J_marker[chosen]
-
     def weights(self, scale: float) -> FloatArray:
         """Robust weights (n,) of the views, for corners of ``scale`` times their variance."""
         return robust(self.chi2, CHI2_OF_VIEW * scale)[1]

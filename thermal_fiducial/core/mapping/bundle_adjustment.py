@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import arms_of_scale, covariance_of, noise_factor, scale_of_map
+from thermal_fiducial.core.error_model import noise_factor
 from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Snapshot
 from thermal_fiducial.core.mapping.error_sources import ErrorSources
@@ -84,42 +84,34 @@ def _scale(chi2: FloatArray) -> float:
 def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> AdjustedMap | None:
     """The outcome with its covariances; None where these do not exist."""
     scale = _scale(now.chi2)
-    n, weights = len(problem.frame), now.weights(scale)
-    unknowns = 6 * (len(problem.stamps) + np.count_nonzero(~problem.held))
+    weights = now.weights(scale)
     full = weights == 1.0
-    chi2, freedom = float(np.sum(now.chi2[full])), int(8 * np.count_nonzero(full) - unknowns)
-    widened = noise_factor(chi2, freedom)
+    unknowns = 6 * (len(problem.stamps) + np.count_nonzero(~problem.held))
+    widened = noise_factor(float(np.sum(now.chi2[full])), int(8 * np.count_nonzero(full) - unknowns))
     system = problem.equations.reduced(problem.normal(now, scale)[0])
     if system is None:
         return None
-    positions = now.state.T_map_marker[:, :3, 3]
+    known = np.stack([snapshot.markers[key].draws for key in problem.ids])
     sources = ErrorSources(problem, system, now, weights, np.random.default_rng(0))
-    lasting = sources.lasting(snapshot.errors)
-    of_held = system.by_held(np.stack([snapshot.markers[key].draws for key in problem.ids]))
-    draws = lasting + sources.noise(widened) + of_held
-    covariances = widened * system.covariances() + covariance_of(lasting) + covariance_of(of_held)
-    covariances += scale_of_map(arms_of_scale(positions, positions[problem.held]), snapshot.errors)
+    covariances, draws = sources.of_markers(widened, snapshot.errors, known)
     if not np.all(np.isfinite(covariances)):
         return None
-    free = [(i, key) for i, key in enumerate(problem.ids) if not problem.held[i]]
     outlying = np.bincount(problem.marker, ~full) / np.bincount(problem.marker)
     outliers = dict(zip(problem.ids, outlying.tolist(), strict=True))
-    views = {key: problem.marker == i for i, key in free}
+    markers, inconsistent = {}, {}
+    for i in np.flatnonzero(~problem.held).tolist():
+        key, own = problem.ids[i], problem.marker == i
+        adjusted = {'T_map_marker': now.state.T_map_marker[i], 'covariance': covariances[i], 'draws': draws[i]}
+        markers[key] = replace(snapshot.markers[key], **adjusted)
+        if two_places(now.r[own], now.J_marker[own], ~full[own]):
+            inconsistent[key] = outliers[key]
     return AdjustedMap(
-        {
-            key: replace(
-                snapshot.markers[key],
-                T_map_marker=now.state.T_map_marker[i],
-                covariance=covariances[i],
-                draws=draws[i],
-            )
-            for i, key in free
-        },
+        markers,
         dict(zip(problem.stamps, now.state.T_map_camera, strict=True)),
-        float(np.sqrt(np.sum(now.squared_px) / (4 * n))),
+        float(np.sqrt(np.sum(now.squared_px) / (4 * len(problem.frame)))),
         now.cost(scale) / widened,
         outliers,
-        {key: outliers[key] for key, own in views.items() if two_places(*now.of_views(own), ~full[own])},
+        inconsistent,
         snapshot.map_revision,
     )
 

@@ -9,7 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import DRAWS, root_of, shape_of_corners, SystematicErrors
+from thermal_fiducial.core.error_model import (
+    arms_of_scale,
+    covariance_of,
+    DRAWS,
+    root_of,
+    scale_of_map,
+    shape_of_corners,
+    SystematicErrors,
+)
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem
 from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
@@ -32,8 +40,22 @@ class ErrorSources:
     weights: FloatArray
     rng: np.random.Generator
 
-    def noise(self, widened: float) -> FloatArray:
-        """(M, 6, K) by noise of corners and priors, whose variances count ``widened`` times."""
+    def of_markers(self, widened: float, errors: SystematicErrors, known: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Covariances (M, 6, 6) of the markers, and joint draws (M, 6, K) of their errors but for the scale.
+
+        Parameters
+        ----------
+        widened : factor of the variances of corners and priors
+        known : (M, 6, K) draws of the held markers; others are not used
+        """
+        lasting, of_held = self._lasting(errors), self.system.by_held(known)
+        positions = self.now.state.T_map_marker[:, :3, 3]
+        covariances = widened * self.system.covariances() + covariance_of(lasting) + covariance_of(of_held)
+        covariances += scale_of_map(arms_of_scale(positions, positions[self.problem.held]), errors)
+        return covariances, lasting + self._noise(widened) + of_held
+
+    def _noise(self, widened: float) -> FloatArray:
+        """(M, 6, K) by noise of corners and priors."""
         problem, roots = self.problem, np.sqrt(widened * self.weights)[:, None, None]
         of_frame, of_marker = (
             np.sqrt(widened) * root_of(priors.information) for priors in (problem.odometry, problem.known)
@@ -46,7 +68,7 @@ class ErrorSources:
 
         return self._solved(sides)
 
-    def lasting(self, errors: SystematicErrors) -> FloatArray:
+    def _lasting(self, errors: SystematicErrors) -> FloatArray:
         """(M, 6, K) by corner errors that are the same in all views of a marker, and by those of the lens.
 
         They do not average out and leave no residuals: the shape of a fixed marker rotates the whole map, and a lens

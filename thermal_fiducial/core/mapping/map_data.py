@@ -10,7 +10,6 @@ from thermal_fiducial.core.error_model import (
     arms_of_scale,
     assumed_draws,
     NO_DRAWS,
-    positive,
     scale_of_map,
     SystematicErrors,
 )
@@ -109,8 +108,8 @@ class MarkerMap:
             return self.copy()
         positions = np.stack([marker.T_map_marker[:3, 3] for marker in vague])
         covariances = np.stack([marker.covariance for marker in vague])
-        covariances = positive(covariances - scale_of_map(arms_of_scale(positions, self.anchors), errors))
-        draws = assumed_draws(positions, covariances)
+        of_scale = scale_of_map(arms_of_scale(positions, self.anchors), errors)
+        draws = assumed_draws(positions, covariances - of_scale)
         drawn = {marker.id: replace(marker, draws=own) for marker, own in zip(vague, draws, strict=True)}
         return replace(self, markers=self.markers | drawn)
 
