@@ -11,12 +11,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import NO_DRAWS, noise_factor, SystematicErrors
+from thermal_fiducial.core.error_model import noise_factor, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.keyframes import Displacement
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.mapping.marker_views import FittedPoses, MarkerView, MarkerViews, SAME_POSE, Viewpoint
+from thermal_fiducial.core.mapping.marker_views import MarkerView, MarkerViews, SAME_POSE, Viewpoint
 from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
 
@@ -33,17 +33,6 @@ INCONSISTENT = 200.0
 TRIALS = 3
 #: Largest number of candidates, which bounds memory against false positives: those observed longest ago are dropped.
 MOST = 1000
-
-
-@dataclass(frozen=True)
-class Placement:
-    """The pose of a new marker, or why there is none yet."""
-
-    T_map_marker: FloatArray | None
-    covariance: FloatArray
-    reason: str = ''
-    #: (6, K) of :class:`MapMarker`
-    draws: FloatArray = field(default_factory=lambda: NO_DRAWS)
 
 
 @dataclass
@@ -86,30 +75,38 @@ class Candidate:
         ]
         self._directions = [T[:3, :3] @ direction for direction, T in zip(self._directions, moves, strict=True)]
 
-    def place(self, camera: Camera, errors: SystematicErrors) -> Placement:
-        """Pose in the map if the views determine it uniquely."""
+    def place(self, camera: Camera, errors: SystematicErrors) -> MapMarker | str:
+        """The marker in the map if the views determine it uniquely, else what it waits for, in words."""
         self.untried = 0
-        nothing = np.zeros((6, 6))
         if len(self.views) < MIN_VIEWS:
-            return Placement(None, nothing, f'marker {self.id} needs views from more directions')
-        fits = self._fits(camera, errors)
+            return f'marker {self.id} needs views from more directions'
+        views = MarkerViews(self.views, self.size, camera, errors)
+        fits = views.fit(self._starts)
         if not fits.chi2[0] <= INCONSISTENT * len(self.views):
-            return Placement(None, nothing, f'marker {self.id}: its views contradict each other')
+            return f'marker {self.id}: its views contradict each other'
         scale = noise_factor(float(fits.chi2[0]), 8 * len(self.views) - 6)
         others = np.flatnonzero(rotation_angle(fits.T[0, :3, :3].T @ fits.T[:, :3, :3]) > SAME_POSE)
         if len(others) and fits.cost[others[0]] - fits.cost[0] < UNAMBIGUOUS * scale:
-            return Placement(None, nothing, f'planar ambiguity of marker {self.id} unsettled')
+            return f'planar ambiguity of marker {self.id} unsettled'
         # The noise of each marker is its own.
-        covariance, draws = fits.errors(scale, np.random.default_rng(self.id))
-        return Placement(fits.T[0], covariance, draws=draws)
+        covariance, draws = views.errors(fits, scale, np.random.default_rng(self.id))
+        return MapMarker(self.id, self.size, False, fits.T[0], covariance, draws=draws)
 
     def solutions(self, camera: Camera) -> list[FloatArray]:
         """All poses (4, 4) that a fit to the views ends in, the best first."""
-        fits, poses = self._fits(camera, SystematicErrors()), list[FloatArray]()
+        fits = MarkerViews(self.views, self.size, camera, SystematicErrors()).fit(self._starts)
+        poses = list[FloatArray]()
         for T in fits.T[np.isfinite(fits.chi2)]:
             if all(rotation_angle(T[:3, :3].T @ other[:3, :3]) > SAME_POSE for other in poses):
                 poses.append(T)
         return poses
+
+    @property
+    def _starts(self) -> FloatArray:
+        """Initial poses (S, 4, 4) of a fit: from every branch of two views far apart."""
+        pairs = [view.viewpoint.poses[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
+        starts = np.concatenate([pair.reshape(-1, 4, 4) for pair in pairs])
+        return np.asarray(starts[np.all(np.isfinite(starts), axis=(1, 2))])
 
     def _drop_most_redundant(self) -> None:
         """Drop the view whose nearest neighbour is the nearest of all."""
@@ -117,12 +114,6 @@ class Candidate:
         cosines = directions @ directions.T - 2.0 * np.eye(len(directions))
         index = int(np.argmax(np.max(cosines, axis=1)))
         del self.views[index], self._directions[index]
-
-    def _fits(self, camera: Camera, errors: SystematicErrors) -> FittedPoses:
-        """Fits from every branch of two views far apart."""
-        pairs = [view.viewpoint.poses[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
-        starts = np.concatenate([pair.reshape(-1, 4, 4) for pair in pairs])
-        return MarkerViews(self.views, self.size, camera, errors).fit(starts[np.all(np.isfinite(starts), axis=(1, 2))])
 
 
 class NewMarkers:
@@ -157,22 +148,12 @@ class NewMarkers:
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
             if not candidate.untried:
                 continue
-            placement = candidate.place(camera, errors)
-            candidate.reason = placement.reason
-            if placement.T_map_marker is not None:
-                placed.append(
-                    MapMarker(
-                        candidate.id,
-                        candidate.size,
-                        False,
-                        placement.T_map_marker,
-                        placement.covariance,
-                        first_seen_ns=stamp_ns,
-                        last_seen_ns=stamp_ns,
-                        draws=placement.draws,
-                    )
-                )
-                del self.candidates[candidate.id]
+            outcome = candidate.place(camera, errors)
+            if isinstance(outcome, str):
+                candidate.reason = outcome
+                continue
+            placed.append(replace(outcome, first_seen_ns=stamp_ns, last_seen_ns=stamp_ns))
+            del self.candidates[candidate.id]
         while len(self.candidates) > MOST:
             del self.candidates[min(self.candidates, key=lambda key: self.candidates[key].views[-1].stamp_ns)]
         return placed, {c.id: c.reason for c in shown if c.id in self.candidates}

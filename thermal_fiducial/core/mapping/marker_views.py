@@ -88,33 +88,9 @@ class FittedPoses:
     #: (S,) of the residuals, and minus twice the logarithm of the likelihood: comparable whatever their covariances are
     chi2: FloatArray
     cost: FloatArray
-    #: (n, 8, 6) derivatives of the best one's whitened residuals by the poses of camera and marker
-    J_camera: FloatArray
-    J_marker: FloatArray
-    #: (n, 6, 6), (n, 6, K) and (n, 6, 2) errors of its cameras, as of :class:`Viewpoint`
-    camera_covariances: FloatArray
-    draws: FloatArray
-    scales: FloatArray
-    #: (n, 8, 8) by which residuals became white; (n, 8, 8) noise of the corners [px^2], and errors of the lens there
+    #: of the best one (n,) which of each camera's two poses was used, and (n, 8, 8) by which residuals became white
+    chosen: IntArray
     W: FloatArray
-    corner_noise: FloatArray
-    of_lens: LensErrors
-
-    def errors(self, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error but for the scales.
-
-        The errors are the corners', whose covariance counts ``noise`` times, and those of the cameras' poses.
-        """
-        white = np.linalg.inv(np.einsum('vri,vrj->ij', self.J_marker, self.J_marker))
-        gains = -white @ np.einsum('vri,vrj->vij', self.J_marker, self.J_camera)
-        of_scales = drawn_sum(gains, self.scales)
-        by_corner = white @ np.swapaxes(self.J_marker, -1, -2) @ self.W
-        of_lens = self.of_lens.drawn().reshape(-1, 8, DRAWS)
-        shared = drawn_sum(gains, self.draws) + drawn_sum(by_corner, of_lens)
-        own = independent_sum(by_corner, self.corner_noise) + independent_sum(gains, self.camera_covariances)
-        own *= noise
-        of_noise = np.linalg.cholesky(own) @ rng.standard_normal((6, DRAWS))
-        return own + of_scales @ of_scales.T + covariance_of(shared), shared + of_noise
 
 
 @dataclass(frozen=True)
@@ -159,14 +135,27 @@ class MarkerViews:
                 break
         cost = chi2 + np.sum(begun.log_determinants, axis=-1)
         order = np.argsort(cost, kind='stable')
-        best, (T_map_camera, _) = order[0], self._cameras(used)
-        _, J_camera, J_marker = self._linearised(T, T_map_camera)
-        W, own = begun.W[best], (np.arange(len(self._corners)), used[best])
-        return FittedPoses(
-            T[order], chi2[order], cost[order],
-            W @ J_camera[best], W @ J_marker[best], self._camera_noise[own], self._draws[own], self._scales,
-            W, self._noise, self._of_lens,
-        )  # fmt: skip
+        best = order[0]
+        return FittedPoses(T[order], chi2[order], cost[order], used[best], begun.W[best])
+
+    def errors(self, fits: FittedPoses, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error but for the scales.
+
+        The errors are the corners', whose covariance counts ``noise`` times, and those of the cameras' poses.
+        """
+        own = np.arange(len(fits.chosen)), fits.chosen
+        _, J_camera, J_marker = (J[0] for J in self._linearised(fits.T[:1], self._T_map_camera[own][None]))
+        J_camera, J_marker = fits.W @ J_camera, fits.W @ J_marker
+        white = np.linalg.inv(np.einsum('vri,vrj->ij', J_marker, J_marker))
+        gains = -white @ np.einsum('vri,vrj->vij', J_marker, J_camera)
+        by_corner = white @ np.swapaxes(J_marker, -1, -2) @ fits.W
+        of_lens = self._of_lens.drawn().reshape(-1, 8, DRAWS)
+        of_scales = drawn_sum(gains, self._scales)
+        shared = drawn_sum(gains, self._draws[own]) + drawn_sum(by_corner, of_lens)
+        alone = independent_sum(by_corner, self._noise) + independent_sum(gains, self._camera_noise[own])
+        alone *= noise
+        of_noise = np.linalg.cholesky(alone) @ rng.standard_normal((6, DRAWS))
+        return alone + of_scales @ of_scales.T + covariance_of(shared), shared + of_noise
 
     def _choose(self, T: FloatArray) -> IntArray:
         """The likelier of the two camera poses of each view, (S, n), for a marker at T."""

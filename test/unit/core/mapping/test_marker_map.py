@@ -1,5 +1,6 @@
 """Algorithm 1: the camera from known markers, and new markers from the camera."""
 
+from dataclasses import replace
 import re
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.error_model import NO_DRAWS
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
@@ -233,3 +235,21 @@ def test_the_running_error_is_the_mean_at_first_and_then_forgets():
         marker = marker.seen(stamp_ns, 0.2)
     # 0.95^180 of the start is left.
     np.testing.assert_allclose(marker.reprojection_error_px, 0.2, rtol=1e-3)
+
+
+def test_a_map_in_memory_gives_the_poses_of_one_from_its_file():
+    """Which has the covariances of its markers, and no draws."""
+    rng = np.random.default_rng(11)
+    poses = wall(rng)
+    m = MarkerMapper(MarkerMapperConfig(), MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
+    for k in range(0, 300, 10):
+        m.process(stamp(k), see(flight(k / 30), poses, 0.05, rng), CAMERA)
+    m.refine()
+    bare = MarkerMap({key: replace(marker, draws=NO_DRAWS) for key, marker in m.map.markers.items()})
+    rows = see(flight(10.0), poses, 0.05, rng)
+    on_both = [
+        MarkerMapper(MarkerMapperConfig(), start).process(stamp(400), rows, CAMERA).pose for start in (m.map, bare)
+    ]
+    np.testing.assert_array_equal(on_both[0].covariance, on_both[1].covariance)
+    # Not only of the corners: of the map.
+    assert np.all(np.linalg.eigvalsh(on_both[0].map_covariance) > 0.0)
