@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.geometry.reprojection import lever_arm
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)
@@ -142,21 +142,23 @@ def scale_of_map(arms: FloatArray, errors: SystematicErrors) -> FloatArray:
     return covariances
 
 
-def assumed_draws(positions: FloatArray, covariances: FloatArray) -> FloatArray:
+def assumed_draws(positions: FloatArray, covariances: FloatArray, placed: BoolArray) -> FloatArray:
     """Joint draws (M, 6, K) of the errors of a map's M markers, of which only the covariance of each is known.
 
-    Each is assumed to have been placed by its nearest better-known one: it has the error of that, moved rigidly, as far
-    as its own covariance allows, and the rest by itself.
+    Those that a mapper has placed are assumed to have been placed by their nearest better-known marker: they have the
+    error of that, moved rigidly, as far as their own covariance allows, and the rest by themselves. Markers that were
+    measured one by one have errors of their own.
 
     Parameters
     ----------
     positions, covariances : (M, 3), (M, 6, 6)
+    placed : (M,) whether a mapper has placed them by what cameras saw
     """
     rng, draws = np.random.default_rng(0), np.zeros((len(positions), 6, DRAWS))
     order = np.argsort(np.trace(covariances, axis1=1, axis2=2), kind='stable')
     for place, index in enumerate(order.tolist()):
         inherited = NO_DRAWS
-        if place:
+        if place and placed[index]:
             arms = positions[index] - positions[order[:place]]
             nearest = int(np.argmin(np.sum(arms**2, axis=1)))
             inherited = lever_arm(arms[nearest]) @ draws[order[nearest]]

@@ -118,7 +118,7 @@ def test_a_rigid_error_of_the_map_is_that_of_the_camera():
     """Markers that are wrong as parts of one rigid map, of which a file has the covariance of each."""
     arms = np.random.default_rng(2).normal(size=(5, 3))
     common, A = np.diag([1e-3] * 3 + [1e-2] * 3) ** 2, by_arms(arms)
-    draws = assumed_draws(arms, A @ common @ np.swapaxes(A, -1, -2))
+    draws = assumed_draws(arms, A @ common @ np.swapaxes(A, -1, -2), np.ones(5, dtype=bool))
     of_pose = covariance_of(drawn_sum(0.2 * np.linalg.inv(A), draws))
     # To rounding, of roots of matrices whose condition is 1e4.
     np.testing.assert_allclose(of_pose, common, rtol=1e-6, atol=1e-6 * common.max())
@@ -130,7 +130,7 @@ def test_assumed_draws_have_the_covariances_of_the_file():
     A = 1e-3 * rng.normal(size=(20, 6, 6))
     positions, covariances = 10.0 * rng.normal(size=(20, 3)), A @ np.swapaxes(A, -1, -2)
     covariances[10:] = np.diag([1e-3] * 3 + [1e-2] * 3) ** 2
-    found = covariance_of(assumed_draws(positions, covariances))
+    found = covariance_of(assumed_draws(positions, covariances, np.arange(20) % 3 > 0))
     # To rounding: covariances are up to 1e-4, and down to 1e-6 of their largest one their roots are inverted.
     np.testing.assert_allclose(found, covariances, rtol=1e-6, atol=1e-12)
 
@@ -138,11 +138,21 @@ def test_assumed_draws_have_the_covariances_of_the_file():
 def test_markers_measured_by_hand_between_surveyed_ones_have_errors_of_their_own():
     fine, rough = np.eye(6) * 0.001**2, np.eye(6) * 0.03**2
     positions = np.stack([np.arange(12.0), np.zeros(12), np.zeros(12)], axis=-1)
-    draws = assumed_draws(positions, np.stack([fine, rough] * 6))[1::2]
+    draws = assumed_draws(positions, np.stack([fine, rough] * 6), np.ones(12, dtype=bool))[1::2]
     correlations = np.einsum('iak,jak->aij', draws, draws) / (DRAWS * 0.03**2)
     # What they hang on is 30 times better known, and moves them by its turn at an arm of a metre. By 64 draws a
     # correlation is known to an eighth: four of its standard deviations.
     assert np.abs(correlations - np.eye(6)).max() < 4 / 8
+
+
+@pytest.mark.parametrize(('placed', 'correlation'), [(True, 1.0), (False, 0.0)])
+def test_markers_that_no_mapper_has_placed_have_errors_of_their_own(placed, correlation):
+    """Of a survey, marker by marker, each to 20 mm."""
+    positions, covariances = np.diag([1.0, 2.0, 3.0]), np.tile(np.diag([0.02] * 3 + [1e-4] * 3) ** 2, (3, 1, 1))
+    draws = assumed_draws(positions, covariances, np.full(3, placed))[:, :3]
+    correlations = np.einsum('iak,jak->aij', draws, draws) / (DRAWS * 0.02**2)
+    # By 64 draws a correlation is known to an eighth: four of its standard deviations.
+    assert np.abs(correlations[:, *np.triu_indices(3, 1)] - correlation).max() < 4 / 8
 
 
 def test_white_and_systematic_errors_are_apart():

@@ -109,7 +109,8 @@ class MarkerMap:
         positions = np.stack([marker.T_map_marker[:3, 3] for marker in vague])
         covariances = np.stack([marker.covariance for marker in vague])
         of_scale = scale_of_map(arms_of_scale(positions, self.anchors), errors)
-        draws = assumed_draws(positions, covariances - of_scale)
+        placed = np.array([marker.observations > 0 for marker in vague])
+        draws = assumed_draws(positions, covariances - of_scale, placed)
         drawn = {marker.id: replace(marker, draws=own) for marker, own in zip(vague, draws, strict=True)}
         return replace(self, markers=self.markers | drawn)
 
