@@ -14,7 +14,7 @@ from thermal_fiducial.calibration.report import BoardView, write_report
 from thermal_fiducial.calibration.sources import is_folder_of_pictures, measured_points
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
 from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures
-from thermal_fiducial.cli.subcommands import add_remap, file_to_write
+from thermal_fiducial.cli.subcommands import add_remap, file_to_write, whole_number
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.mapping.map_data import MarkerMap
@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--models', default=','.join(CANDIDATES), metavar='NAMES', help='models to choose among, by held-out error'
     )
     parser.add_argument('--focal-px', type=float, default=600.0, help='rough focal length to start from [px]')
-    parser.add_argument('--most-views', type=int, default=80, help='stop looking for views after this many')
+    parser.add_argument('--most-views', type=whole_number(1), default=80, help='stop looking for views after this many')
     parser.add_argument('--every', type=int, default=5, help='look at every n-th frame of a bag')
     parser.add_argument(
         '--size', type=int, nargs=2, metavar=('WIDTH', 'HEIGHT'), help='size of the image, needed with a CSV file'

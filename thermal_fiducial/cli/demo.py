@@ -10,6 +10,7 @@ from typing import Any, TYPE_CHECKING
 
 from thermal_fiducial.cli.evaluate import make_video, print_tables
 from thermal_fiducial.cli.progress import counted, progress_bar
+from thermal_fiducial.cli.subcommands import whole_number
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.packages import is_installed, require_plots
 from thermal_fiducial.report.page import evaluate_run, Evaluation, require_packages, write_page
@@ -31,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument('--out', type=Path, default=Path('runs/demo'), metavar='RUN', help='folder')
     parser.add_argument('--seconds', type=float, default=30.0, help='length of the flight [s], 11 or more')
-    parser.add_argument('--seed', type=int, default=0, help='seed of path and noise')
+    parser.add_argument('--seed', type=whole_number(0), default=0, help='seed of path and noise')
     parser.add_argument('--picture', type=Path, metavar='PNG', help='also draw frame, map and error into one picture')
     parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
 

@@ -73,6 +73,13 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, **options: Any) -> None:
         super().__init__(**{'formatter_class': _Help, **options})
 
+    def parse_known_args(self, *given: Any, **options: Any) -> Any:
+        """Name arguments that a command does not have with its own usage; argparse does with that of the program."""
+        args, unknown = super().parse_known_args(*given, **options)
+        if unknown and self.prog != PROGRAM:
+            self.error(f'unrecognized arguments: {" ".join(unknown)}')
+        return args, unknown
+
     def error(self, message: str) -> NoReturn:
         """End the process for wrong usage, and name what lists the arguments."""
         super().error(f'{message} ({self.prog} --help)')

@@ -6,14 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 import re
+import sys
 
 import numpy as np
 
 from thermal_fiducial.cli.map_photos import detect_in_photos, isotropic, photos_in
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.run_parameters import camera_of_run, sizes_of_run
-from thermal_fiducial.cli.subcommands import file_to_write
+from thermal_fiducial.cli.run_parameters import camera_of_run, dictionary_of_run, sizes_of_run
+from thermal_fiducial.cli.subcommands import file_to_write, whole_number
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
@@ -30,6 +31,7 @@ from thermal_fiducial.files.dictionary import (
 )
 from thermal_fiducial.files.map_history import digest, save_with_history
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.reading import require_regular
 from thermal_fiducial.map_tools import map_editing
 from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.map_tools.map_doubts import Doubt, doubts
@@ -54,7 +56,7 @@ def add_build(parser: argparse.ArgumentParser) -> None:
         '--dictionary', help=f'dictionary or dictionary file (default: that of --map, with --origin {_DICTIONARY})'
     )
     start = parser.add_mutually_exclusive_group(required=True)
-    start.add_argument('--origin', type=int, metavar='ID', help='marker that becomes the origin of the map')
+    start.add_argument('--origin', type=whole_number(0), metavar='ID', help='marker that becomes the origin of the map')
     start.add_argument('--map', type=Path, metavar='MAP', help='map with known markers to start from')
     add_thickness(parser)
     parser.add_argument('--out', type=file_to_write, required=True, metavar='MAP', help='the map to write')
@@ -68,7 +70,9 @@ def add_refine(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--calibration', type=Path, metavar='FILE', help='camera_info YAML of the camera (default: that of the run)'
     )
-    parser.add_argument('--max-frames', type=int, default=1500, metavar='N', help='frames used, evenly chosen')
+    parser.add_argument(
+        '--max-frames', type=whole_number(1), default=1500, metavar='N', help='frames used, evenly chosen'
+    )
     parser.add_argument('--out', type=file_to_write, metavar='FILE', help='default: MAP itself')
     parser.set_defaults(do=_refine)
 
@@ -108,17 +112,27 @@ def _build(args: argparse.Namespace) -> int:
 
 def _refine(args: argparse.Namespace) -> int:
     work = _MapInProgress.of(args.out or args.map, f'refine from {args.run_folder.name}')
+    file = args.run_folder
+    if file.is_dir():
+        file /= 'detections.csv'
+        require_regular(file)
     camera = camera_of_run(args.run_folder) if args.calibration is None else load_camera(args.calibration)
     size, overrides = sizes_of_run(args.run_folder)
     args.marker_size = args.marker_size or size
     args.marker_size_override = [*overrides, *args.marker_size_override]
     start = load_map(args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
     args.marker_size = args.marker_size or _only_size(start)
-    file = args.run_folder / 'detections.csv' if args.run_folder.is_dir() else args.run_folder
+    _warn_of_other_dictionary(args, start)
     frames = _read_detections(file, start, args, camera)
     if len(frames) > args.max_frames:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, args.max_frames).astype(int)]
     return _grow(args, frames, camera, start, work)
+
+
+def _warn_of_other_dictionary(args: argparse.Namespace, start: MarkerMap) -> None:
+    of_run = dictionary_of_run(args.run_folder)
+    if of_run and (other := other_patterns(start.markers, start.dictionary, of_run, args.map.parent)):
+        print(f'warning: {args.map} and {args.run_folder}: {other}', file=sys.stderr)
 
 
 def _only_size(marker_map: MarkerMap) -> float | None:

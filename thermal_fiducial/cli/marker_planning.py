@@ -8,7 +8,7 @@ from rich.table import Table
 
 from thermal_fiducial.cli.marker_drawings import add_force, refuse_to_overwrite
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.subcommands import file_to_write
+from thermal_fiducial.cli.subcommands import file_to_write, whole_number
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
@@ -23,12 +23,13 @@ from thermal_fiducial.fabrication.planning import (
     PACKAGED,
     save_measurements,
 )
+from thermal_fiducial.fabrication.plate import PlateOptions
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.packages import require_plots
 from thermal_fiducial.files.writing import new_file
 
-# Pitch of a Tau 2's pixels [mm].
-_PITCH_MM = 0.017
+# Pitch of a Tau 2's pixels, and shortest focal length, of which a smaller number is probably in metres [mm].
+_PITCH_MM, _SHORTEST_MM = 0.017, 0.5
 _FADE_SECONDS = (0.0, 30.0, 60.0, 120.0, 300.0, 900.0, 3600.0)
 _STAND_OFFS_MM = (0.0, 0.5, 2.0, 5.0, 10.0, 20.0)
 # Sides [px] from the detector's min_side_px to a marker that fills the image, closer where tilted markers change from
@@ -47,7 +48,7 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
     camera.add_argument('--netd', type=float, default=0.05, metavar='K', help='temporal noise of the camera')
     marker = parser.add_argument_group('marker')
     marker.add_argument('--size', type=float, default=300.0, metavar='MM', help='side of the black square')
-    marker.add_argument('--bits', type=int, default=4, help='bits along a side of the dictionary')
+    marker.add_argument('--bits', type=whole_number(3), default=4, help='bits along a side of the dictionary')
     marker.add_argument('--thickness', type=float, default=3.0, metavar='MM', help='thickness of the acrylic')
     marker.add_argument(
         '--stand-off', type=float, default=10.0, metavar='MM', help='air gap between warm surface and sheet'
@@ -82,6 +83,8 @@ def _plan(args: argparse.Namespace) -> int:
         require_plots()
     distances = _numbers(args.distances)
     mounting = Mounting(1e-3 * args.thickness, 1e-3 * args.stand_off, args.loss)
+    # The same sizes as are drawn.
+    PlateOptions(size=args.size, thickness=args.thickness)
     share = float(remaining_contrast(mounting, args.after))
     contrast = args.contrast * share
     measurements = load_measurements(args.tables)
@@ -111,8 +114,8 @@ def _numbers(text: str) -> list[float]:
 def _camera(args: argparse.Namespace) -> Camera:
     if args.calibration is not None:
         return load_camera(args.calibration)
-    if not args.lens > 0.0:
-        raise InputError(f'--lens {args.lens:g} mm is no focal length')
+    if not args.lens >= _SHORTEST_MM:
+        raise InputError(f'--lens {args.lens:g} mm is no focal length: those are in millimetres')
     focal = args.lens / _PITCH_MM
     return Camera(640, 512, np.array([[focal, 0.0, 319.5], [0.0, focal, 255.5], [0.0, 0.0, 1.0]]))
 
@@ -201,8 +204,10 @@ def add_measure(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``markers measure``."""
     parser.set_defaults(do=_measure)
     parser.add_argument('out', type=file_to_write, help='file to write (YAML)')
-    parser.add_argument('--markers', type=int, default=16, help='number of markers for each side, contrast and tilt')
-    parser.add_argument('--seed', type=int, default=1, help='seed of the rendering')
+    parser.add_argument(
+        '--markers', type=whole_number(1), default=16, help='number of markers for each side, contrast and tilt'
+    )
+    parser.add_argument('--seed', type=whole_number(0), default=1, help='seed of the rendering')
     add_force(parser)
 
 

@@ -6,7 +6,7 @@ from collections import Counter
 from thermal_fiducial.cli import marker_drawings, marker_planning
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.subcommands import add_command, file_to_write
+from thermal_fiducial.cli.subcommands import add_command, file_to_write, whole_number
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.errors import InputError
@@ -105,9 +105,11 @@ def _add_dictionary(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--bits', type=int, default=4, help='bits along a side')
     parser.add_argument('--distance', type=int, default=4, help='least Hamming distance')
-    parser.add_argument('--count', type=int, help='number of markers to keep, the stiffest first (default: all)')
-    parser.add_argument('--seed', type=int, default=1, help='the same seed and restarts give the same file')
-    parser.add_argument('--restarts', type=int, default=1000, help='codes to try')
+    parser.add_argument(
+        '--count', type=whole_number(1), help='number of markers to keep, the stiffest first (default: all)'
+    )
+    parser.add_argument('--seed', type=whole_number(0), default=1, help='the same seed and restarts give the same file')
+    parser.add_argument('--restarts', type=whole_number(1), default=1000, help='codes to try')
     parser.add_argument(
         '--signed', action='store_true', help='keep the distance also from the negatives of all markers'
     )

@@ -48,6 +48,12 @@ def sizes_of_run(run: Path) -> tuple[float | None, tuple[str, ...]]:
     return (float(size), tuple(map(str, overrides))) if known else (None, ())
 
 
+def dictionary_of_run(run: Path) -> str:
+    """Dictionary of the detector of a run; empty if it is unknown."""
+    name = _parameter(run, 'aruco_detector', 'dictionary')
+    return name if isinstance(name, str) else ''
+
+
 def _parameter(run: Path, node: str, name: str) -> Any:
     """A parameter of a node in the replay; None if it is unknown."""
     path = run / 'parameters.yaml'

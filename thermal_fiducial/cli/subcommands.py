@@ -1,6 +1,7 @@
 """Sub-commands of the program and of its commands, and arguments that many have."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import TypeAlias
 
@@ -21,6 +22,21 @@ def add_remap(parser: argparse.ArgumentParser) -> None:
         metavar='FROM:=TO',
         help='rename a topic of the bag; may be given several times',
     )
+
+
+def whole_number(least: int) -> Callable[[str], int]:
+    """Type of an argument: a whole number from ``least`` to that of the largest seed, 2^32 - 1."""
+
+    def number(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            value = least - 1
+        if not least <= value < 2**32:
+            raise argparse.ArgumentTypeError(f'{text!r} is not a whole number, {least} or more')
+        return value
+
+    return number
 
 
 def file_to_write(text: str) -> Path:

@@ -20,9 +20,9 @@ from thermal_fiducial.fabrication.shape import contour, Rectangle, trace
 MOUNTS = ('ears', 'frame', 'none')
 
 # Width of acrylic around a mounting hole [mm]: the thickness of usual sheets, the least that a bolt may clamp.
-#: Smallest side [mm]: a smaller number is probably in metres.
-_SMALLEST_MM = 5.0
 _WALL_MM = 3.0
+# Smallest side, and thicknesses that the nodes take, without foil [mm]: other numbers are probably in metres.
+_SMALLEST_MM, _THICKNESSES_MM = 5.0, (0.1, 50.0)
 # Width of a tab and length of its neck, in sides of the marker: the tab has room for the engraving, and the camera
 # resolves the warm background between tab and edge. Together they are below 12 % of a side, which OpenCV smooths away
 # in its search for squares.
@@ -75,6 +75,9 @@ class PlateOptions:
             raise InputError('lengths of a marker plate must be positive')
         if self.size < _SMALLEST_MM:
             raise InputError(f'a marker of {self.size:g} mm: sizes are in millimetres, {_SMALLEST_MM:g} and more')
+        if not _THICKNESSES_MM[0] <= self.thickness <= _THICKNESSES_MM[1]:
+            allowed = '{:g} to {:g}'.format(*_THICKNESSES_MM)
+            raise InputError(f'a plate of {self.thickness:g} mm: thicknesses are in millimetres, {allowed}')
         if self.mount == 'frame' and self.frame_width < self.hole_diameter + _WALL_MM:
             raise InputError(f'a frame of {self.frame_width:g} mm has no room for holes of {self.hole_diameter:g} mm')
 

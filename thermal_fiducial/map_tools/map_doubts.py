@@ -16,6 +16,8 @@ ALL_LARGE_PX = 0.3
 # Share of the markers that counts as nearly all, and fewest markers for that verdict.
 _NEARLY_ALL, _FEW = 0.9, 3
 _WIDE_M = 0.1
+# Distance from the origin beyond which a position is probably in millimetres [m].
+_FAR_M = 1000.0
 
 
 class Doubt(NamedTuple):
@@ -43,6 +45,8 @@ def _doubts_of(marker: MapMarker) -> list[Doubt]:
     sigma = float(np.sqrt(max(np.trace(marker.covariance[:3, :3]), 0.0)))
     if not marker.trusted:
         found.append(('in quarantine, it disagrees with the others', False))
+    if (far := float(np.linalg.norm(marker.T_map_marker[:3, 3]))) > _FAR_M:
+        found.append((f'{far:.0f} m from the origin: positions are in metres', False))
     if sigma > _WIDE_M:
         found.append((f'known to {sigma:.2f} m only', False))
     if marker.reprojection_error_px > LARGE_PX:

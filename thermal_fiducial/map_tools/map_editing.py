@@ -157,7 +157,7 @@ def with_covariances(marker_map: MarkerMap, position_std: float, rotation_std: f
 def _get(marker_map: MarkerMap, marker_id: int) -> MapMarker:
     if marker_id not in marker_map.markers:
         known = ', '.join(str(key) for key in sorted(marker_map.markers)) or 'none'
-        raise InputError(f'marker {marker_id} is not in the map (there are {known})')
+        raise InputError(f'marker {marker_id} is not in the map; the IDs of its markers: {known}')
     return marker_map.markers[marker_id]
 
 

@@ -1,6 +1,7 @@
 """Parameters of a replay: those of the nodes from a ROS parameter file, checked before anything starts."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
 from thermal_fiducial.files.marker_map import load_map, other_frame
 from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
 
 
@@ -70,11 +72,12 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any], second_came
     overrides = dict(overrides) | ({'second_camera': second_camera} if second_camera else {})
     named = (section.get('second_camera') for section in (*document.values(), overrides))
     seconds = {str(name) for name in named if name}
-    configs = {node: _config(node, _values_for(node, document, seconds), overrides) for node in NODES}
-    settings = Settings(**configs)
-    if second_camera:
-        own = (_config(node, _values_for_second(node, document, second_camera), overrides) for node in OF_CAMERA)
-        settings = replace(settings, second=tuple(own))
+    with nullcontext() if params is None else naming(params):
+        configs = {node: _config(node, _values_for(node, document, seconds), overrides) for node in NODES}
+        settings = Settings(**configs)
+        if second_camera:
+            own = (_config(node, _values_for_second(node, document, second_camera), overrides) for node in OF_CAMERA)
+            settings = replace(settings, second=tuple(own))
     warnings = _check_files(settings)
     if document and not any(_values_for(node, document, seconds) for node in NODES):
         warnings.append(f'{params}: nothing in it is for our nodes: it is for {", ".join(document)}')

@@ -33,12 +33,40 @@ def test_wrong_usage_exits_with_2(argv, capsys):
 
 @pytest.mark.parametrize(
     ('argv', 'lists'),
-    [([], 'thermal-fiducial --help'), (['map'], 'thermal-fiducial map --help'), (['map', 'fix'], 'map fix --help')],
+    [
+        ([], 'thermal-fiducial --help'),
+        (['map'], 'thermal-fiducial map --help'),
+        (['map', 'fix'], 'map fix --help'),
+        (['markers', 'check', 'x.png'], 'markers check --help'),
+    ],
 )
 def test_wrong_usage_names_what_lists_the_arguments(argv, lists, capsys):
     with pytest.raises(SystemExit):
         main(argv)
     assert lists in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    'words',
+    [
+        ['demo', '--seed', '-1'],
+        ['map', 'refine', 'map.yaml', 'run', '--max-frames', '0'],
+        ['map', 'build', 'photos', '--calibration', 'tau2.yaml', '--out', 'map.yaml', '--origin', '-1'],
+        ['markers', 'dictionary', 'own.yaml', '--count', '0'],
+        ['markers', 'dictionary', 'own.yaml', '--seed', '-1'],
+        ['markers', 'dictionary', 'own.yaml', '--restarts', '2.5'],
+        ['markers', 'measure', 'own.yaml', '--markers', '0'],
+        ['markers', 'plan', '--bits', '-4'],
+        ['calibrate', 'intrinsics', 'views', '--out', 'tau2.yaml', '--target', 'circles', '--most-views', '0'],
+    ],
+)
+def test_numbers_that_cannot_be_are_named_with_their_option(words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(words)
+    assert stopped.value.code == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    (option,) = (word for word in words if f'argument {word}: ' in last)
+    assert f'argument {option}: {words[words.index(option) + 1]!r} is not a whole number' in last
 
 
 @pytest.mark.parametrize('name', ['a' * 300, 'a/' * 3000, 'file/b'])

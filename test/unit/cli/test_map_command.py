@@ -78,6 +78,14 @@ def test_check_distinguishes_sound_from_doubtful(path, capsys):
     assert doubts.endswith(': 2 doubts\n')
 
 
+def test_positions_in_millimetres_are_doubtful(path, capsys):
+    T = np.eye(4)
+    T[0, 3] = 2500.0
+    save_map(path, MarkerMap({7: MapMarker(7, SIZE, True, T)}))
+    assert run('check', path) == 1
+    assert 'marker 7: 2500 m from the origin: positions are in metres' in capsys.readouterr().out
+
+
 @pytest.mark.parametrize('name', ['gone.yaml', '/elsewhere/own.yaml'])
 def test_check_names_a_dictionary_that_cannot_be_opened(name, path, capsys):
     """It said "sound" although it had not looked at the IDs. Edits need no dictionary."""
@@ -234,6 +242,27 @@ def test_a_run_that_is_not_there_and_a_folder_for_a_map_are_named(path, tmp_path
     assert f'{tmp_path / "run"}: no such run' in capsys.readouterr().err
     assert run('show', tmp_path) == 2
     assert f'{tmp_path}: is a folder, not a file' in capsys.readouterr().err
+
+
+def test_refine_names_what_a_folder_lacks_that_is_no_run(path, tmp_path, capsys):
+    """A bag, for example: it said that a calibration was missing."""
+    save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, np.eye(4))}))
+    (tmp_path / 'bag').mkdir()
+    assert run('refine', path, tmp_path / 'bag') == 2
+    assert f'{tmp_path / "bag" / "detections.csv"}: cannot read it' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('of_run', ['DICT_4X4_50', 'DICT_5X5_100'])
+def test_refine_warns_of_detections_in_another_dictionary(path, poses, photographed, capsys, of_run):
+    folder = path.with_name('run')
+    folder.mkdir()
+    file, *calibration = photographed
+    file.rename(folder / 'detections.csv')
+    (folder / 'parameters.yaml').write_text(f'/aruco_detector: {{ros__parameters: {{dictionary: {of_run}}}}}')
+    save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}, dictionary='DICT_4X4_50'))
+    assert run('--marker-size', SIZE, 'refine', path, folder, *calibration) == 0
+    warned = 'the map has markers of DICT_4X4_50, but dictionary is DICT_5X5_100' in capsys.readouterr().err
+    assert warned is (of_run == 'DICT_5X5_100')
 
 
 def test_refine_refuses_the_calibration_of_a_smaller_image(path, photographed, capsys):

@@ -430,6 +430,10 @@ def test_commands_write_the_files_that_they_print(tmp_path, capsys):
 def test_sizes_in_metres_and_a_file_in_the_place_of_the_folder_are_named(tmp_path, capsys):
     assert main(['markers', 'make', '--ids', '1', '--size', '0.3', '--out', str(tmp_path / 'plates')]) == 2
     assert 'a marker of 0.3 mm: sizes are in millimetres' in capsys.readouterr().err
+    # The nodes would take 3 micrometres for no thickness at all, and refuse 0.3 m.
+    for thickness in ('0.003', '300'):
+        assert main(['markers', 'make', '--ids', '1', '--thickness', thickness, '--out', str(tmp_path / 'plates')]) == 2
+        assert f'a plate of {thickness} mm: thicknesses are in millimetres' in capsys.readouterr().err
     (tmp_path / 'file').write_text('')
     assert main(['markers', 'make', '--ids', '1', '--out', str(tmp_path / 'file')]) == 2
     assert f'{tmp_path}/file: File exists' in capsys.readouterr().err

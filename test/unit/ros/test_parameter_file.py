@@ -43,7 +43,7 @@ def test_a_replay_takes_the_file():
 def test_an_unknown_name_is_refused_in_a_section_of_ours(tmp_path, section):
     file = tmp_path / 'rig.yaml'
     file.write_text(yaml.safe_dump({section: {'ros__parameters': {'imu': {'gyroscope_noise': 1e-3}}}}))
-    with pytest.raises(InputError, match=r'parameter imu\.gyroscope_noise: no node has it'):
+    with pytest.raises(InputError, match=r'rig\.yaml: parameter imu\.gyroscope_noise: no node has it'):
         read_settings(file, {})
 
 
