@@ -23,7 +23,6 @@ from thermal_fiducial.errors import InputError
 
 #: Reason of a reset after a jump of the IMU's stamps, and of poses that wait until it is explained.
 CLOCK_JUMPED = "the IMU's clock has jumped"
-_UNMOVED = np.eye(4)
 
 
 class PoseEkf:
@@ -55,8 +54,8 @@ class PoseEkf:
         self._first_offset = camera_time_offset
         self._noise = ImuNoiseMonitor(config.imu)
         self._history = History(config, camera_time_offset)
-        #: corrections of the map since then: the filter estimates in the map as it was, and does not notice them
-        self._T_map_first = _UNMOVED
+        #: corrections of the map since then, which the filter does not notice: it estimates in the map as it was
+        self._T_map_first: FloatArray | None = None
         #: on the last IMU sample
         self._verdict = Verdict.USE
 
@@ -84,8 +83,7 @@ class PoseEkf:
         if history.main is None:
             return None
         published = odometry(history.main.estimate, history.contradicting(), history.imu.last)
-        unmoved = self._T_map_first is _UNMOVED
-        return published if unmoved else in_corrected_map(published, self._T_map_first)
+        return published if self._T_map_first is None else in_corrected_map(published, self._T_map_first)
 
     def keep_imu(self, sample: ImuSample) -> bool:
         """Buffer an IMU sample without propagating to it: the next :meth:`add_imu` propagates over all buffered ones.
@@ -119,7 +117,9 @@ class PoseEkf:
         ``pose.stamp_ns`` is in the camera's clock; the clock offset, parameter and estimate, is added here.
         """
         off_grid_ns = self._frame_grid.off_grid(pose.stamp_ns) if self._config.estimate_time_offset else 0
-        pose = self._in_present_clock(in_moved_map(pose, inverse(self._T_map_first)))
+        if self._T_map_first is not None:
+            pose = in_moved_map(pose, inverse(self._T_map_first))
+        pose = self._in_present_clock(pose)
         if self._history.main is None and self._camera_clock.in_question:
             return PoseUpdate(pose.stamp_ns, False, CLOCK_JUMPED, np.nan)
         if reason := self._unusable(pose):
@@ -165,7 +165,7 @@ class PoseEkf:
         if self._history.main is None:
             self._history.forget_poses()
             return
-        self._T_map_first = T_new_old @ self._T_map_first
+        self._T_map_first = T_new_old if self._T_map_first is None else T_new_old @ self._T_map_first
 
     def _unusable(self, pose: CameraPose) -> str:
         """Why a pose cannot be used; empty if it can."""
@@ -188,7 +188,9 @@ class PoseEkf:
     def state(self) -> NavigationState | None:
         """Estimate at the newest IMU sample."""
         main = self._history.main
-        return main.estimate.state.in_moved_map(self._T_map_first) if main else None
+        if main is None or self._T_map_first is None:
+            return main and main.estimate.state
+        return main.estimate.state.in_moved_map(self._T_map_first)
 
     @property
     def estimate(self) -> Estimate | None:
@@ -264,8 +266,8 @@ class PoseEkf:
             'vibration rad/s/sqrt(Hz)': rate,
             'vibration m/s^2/sqrt(Hz)': force,
         }
-        main = self._history.main
-        if main is None:
+        main, state = self._history.main, self.state
+        if main is None or state is None:
             return numbers
         of_filter = {
             'resets': float(self.resets),
@@ -273,4 +275,4 @@ class PoseEkf:
             'time offset': self._clock_offset(main),
             'time offset std': self._time_offset_std(main),
         }
-        return numbers | of_filter | figures_of(self._history, main, self._T_map_first, self._config.gravity)
+        return numbers | of_filter | figures_of(self._history, main, state, self._config.gravity)

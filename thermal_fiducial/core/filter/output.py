@@ -150,12 +150,11 @@ def _without_estimate(belief: Belief, config: PoseEkfConfig) -> Condition:
     return Condition('initialising', f'{begun.hits} of {config.initial_poses} poses') if begun else WAITING
 
 
-def figures_of(history: History, main: Hypothesis, T_map_first: FloatArray, gravity: float) -> dict[str, float]:
+def figures_of(history: History, main: Hypothesis, state: NavigationState, gravity: float) -> dict[str, float]:
     """Figures of the estimate ``main`` for the diagnostics (SI units).
 
-    ``T_map_first`` (4, 4): the map that it is in, in the present one; ``gravity``: its size.
+    ``state``: that of ``main``, in the present map; ``gravity``: its size.
     """
-    state = main.estimate.state.in_moved_map(T_map_first)
     white, jitter, vibration = main.estimate.pose_noise.stds
     return {
         'seconds since accepted pose': coasting_seconds(history, main),
