@@ -46,34 +46,23 @@ class Candidate:
     reason: str = 'not judged yet'
     #: views since it was last judged
     untried: int = 0
-    _directions: list[FloatArray] = field(default_factory=list)
 
     def add(self, view: MarkerView) -> None:
         """Keep ``view`` if its direction is new, or in place of a view of the same frame with an older camera pose."""
-        # Both branches put the centre at the same place: the direction doesn't depend on the ambiguity.
-        arm = view.viewpoint.T_map_camera[0, :3, :3] @ view.branches[0, :3, 3]
-        direction = -arm / np.linalg.norm(arm)
         stamps = [kept.stamp_ns for kept in self.views]
         if view.stamp_ns in stamps:
-            index = stamps.index(view.stamp_ns)
-            self.views[index], self._directions[index] = view, direction
-        elif self._directions and np.max(np.stack(self._directions) @ direction) > np.cos(MIN_SEPARATION):
+            self.views[stamps.index(view.stamp_ns)] = view
+        elif self.views and np.max(self._directions @ view.direction) > np.cos(MIN_SEPARATION):
             return
         else:
             self.views.append(view)
-            self._directions.append(direction)
         self.untried += 1
         if len(self.views) > MAX_VIEWS:
             self._drop_most_redundant()
 
     def move(self, displacement: Displacement) -> None:
         """Apply a displacement of the map to the views' camera poses."""
-        moves = [displacement.at(view.stamp_ns) for view in self.views]
-        self.views = [
-            replace(view, viewpoint=replace(view.viewpoint, T_map_camera=T @ view.viewpoint.T_map_camera))
-            for view, T in zip(self.views, moves, strict=True)
-        ]
-        self._directions = [T[:3, :3] @ direction for direction, T in zip(self._directions, moves, strict=True)]
+        self.views = [view.moved(displacement.at(view.stamp_ns)) for view in self.views]
 
     def place(self, camera: Camera, errors: SystematicErrors) -> MapMarker | str:
         """The marker in the map if the views determine it uniquely, else what it waits for, in words."""
@@ -110,10 +99,13 @@ class Candidate:
 
     def _drop_most_redundant(self) -> None:
         """Drop the view whose nearest neighbour is the nearest of all."""
-        directions = np.stack(self._directions)
-        cosines = directions @ directions.T - 2.0 * np.eye(len(directions))
-        index = int(np.argmax(np.max(cosines, axis=1)))
-        del self.views[index], self._directions[index]
+        cosines = self._directions @ self._directions.T - 2.0 * np.eye(len(self.views))
+        del self.views[int(np.argmax(np.max(cosines, axis=1)))]
+
+    @property
+    def _directions(self) -> FloatArray:
+        """Unit vectors (n, 3) from the marker to the cameras, in the map."""
+        return np.stack([view.direction for view in self.views])
 
 
 class NewMarkers:

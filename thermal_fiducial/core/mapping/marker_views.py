@@ -1,7 +1,8 @@
 """Fit of a marker's pose to its views; the camera pose of a view is uncertain, and may be one of two."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -77,6 +78,18 @@ class MarkerView:
     corner_covariances: FloatArray
     #: (2, 4, 4) both branches of T_camera_marker, the better one first
     branches: FloatArray
+
+    @cached_property
+    def direction(self) -> FloatArray:
+        """Unit vector (3,) from the marker to the camera, in the map."""
+        # Both branches put the centre at the same place: the direction doesn't depend on the ambiguity.
+        arm = self.viewpoint.T_map_camera[0, :3, :3] @ self.branches[0, :3, 3]
+        return np.asarray(-arm / np.linalg.norm(arm))
+
+    def moved(self, T_new_old: FloatArray) -> 'MarkerView':
+        """The same view in a displaced map."""
+        T_map_camera = T_new_old @ self.viewpoint.T_map_camera
+        return replace(self, viewpoint=replace(self.viewpoint, T_map_camera=T_map_camera))
 
 
 @dataclass(frozen=True)
