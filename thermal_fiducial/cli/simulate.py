@@ -11,6 +11,7 @@ from thermal_fiducial.cli.simulate_corners import write_corner_flight
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import STORAGES
 from thermal_fiducial.sim.recorded import RecordedFlight
+from thermal_fiducial.sim.render import Quality
 from thermal_fiducial.sim.scenario import LENSES, named, Scenario, SCENARIOS, with_contrast, with_lens
 from thermal_fiducial.sim.sensor import FFC_BEHAVIOURS, Sensor
 from thermal_fiducial.sim.thermal_camera import FlightPlan, plan
@@ -25,6 +26,7 @@ _RANGES = {
     'fog': (0.0, 100.0),
     'lag': (0.0, 0.1),
     'readout': (0.0, 0.05),
+    'frame_rate': (1.0, 120.0),
     'time_offset': (-1.0, 1.0),
     'workers': (1, 64),
 }
@@ -61,6 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='S',
         help=f'rolling shutter: time from the first row to the last [s] (default: {_OWN})',
     )
+    parser.add_argument('--frame-rate', type=float, metavar='HZ', help=f'of the camera (default: {_OWN})')
     parser.add_argument(
         '--ffc', choices=(*FFC_BEHAVIOURS, 'never'), help=f'output during shutter events (default: {_OWN})'
     )
@@ -93,7 +96,7 @@ def run(args: argparse.Namespace) -> int:
         if value is not None and not low <= value <= high:
             raise InputError(f'--{name.replace("_", "-")} {value} is outside {low} .. {high}')
     scenario = _scenario(args)
-    flight = plan(scenario, args.seconds, args.seed)
+    flight = plan(scenario, args.seconds, args.seed, quality=_quality(scenario.sensor.frame_rate))
     with progress_bar(f'{scenario.name}, {flight.seconds:g} s') as show:
         advance = counted(show, flight.frame_count)
         if scenario.corner_noise is None:
@@ -122,7 +125,15 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     return replace(scenario, sensor=_sensor(scenario.sensor, args))
 
 
+def _quality(frame_rate: float) -> Quality:
+    """Sub-frames as short as the usual ones of the usual rate, so that motion is sampled as finely."""
+    usual = Quality()
+    return replace(usual, sub_frames=max(1, round(usual.sub_frames * Sensor().frame_rate / frame_rate)))
+
+
 def _sensor(sensor: Sensor, args: argparse.Namespace) -> Sensor:
+    if args.frame_rate is not None:
+        sensor = replace(sensor, frame_rate=args.frame_rate)
     if args.lag is not None:
         sensor = replace(sensor, lag=args.lag)
     if args.readout is not None:

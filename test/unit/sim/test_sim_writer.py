@@ -227,6 +227,17 @@ def test_command_writes_a_bag_and_prints_how_to_replay_it(tiny_scenario, tmp_pat
     assert 'readout_time: 0.01' in (out / 'params.yaml').read_text()
 
 
+def test_command_takes_a_frame_rate(tiny_scenario, tmp_path):
+    out = tmp_path / 'bag'
+    options = ['--scenario', 'tiny', '--seconds', '2', '--ffc', 'never', '--frame-rate', '8.5', '--workers', '1']
+    assert main(['simulate', str(out), *options]) == 0
+    with BagReader(out) as reader:
+        stamps = [stamp_to_ns(item.message.header.stamp) for item in reader.messages(['thermal/image_raw'])]
+    # Stamps are rounded to nanoseconds.
+    np.testing.assert_allclose(np.diff(stamps), 1e9 / 8.5, atol=1.0)
+    assert len(stamps) == 17
+
+
 def test_command_follows_a_trajectory(tiny_scenario, tmp_path):
     lines = [f'{n / 10} {0.01 * n} 0 0.7 0 0 0 1\n' for n in range(31)]
     (tmp_path / 'path.tum').write_text(''.join(lines))
@@ -247,6 +258,7 @@ def test_command_follows_a_trajectory(tiny_scenario, tmp_path):
         (['--seconds', 'nan'], '--seconds nan is outside'),
         (['--seed', '-1'], '--seed -1'),
         (['--time-offset', '2'], '--time-offset 2.0'),
+        (['--frame-rate', '0'], '--frame-rate 0.0'),
         (['--trajectory', 'nowhere.tum'], 'nowhere.tum'),
     ],
 )
