@@ -4,6 +4,8 @@ A pattern is sampled on a grid in the marker's own coordinates [cells], where ce
 columns and that of its rows are products. A blur that is oblique there, as that of a tilted marker and of motion, has a
 correlation c besides, and a Gaussian with it is exp(c d2/dxdy) of one without.
 
+Straight lines are bent by the lens: between its corners a marker is displaced as a parabola of the places in it.
+
 All that is linear is part of the model. The warm surface and the sheet before it each have a temperature that is linear
 across the marker, so level and contrast are. The surface may be warmest in its middle, and may end one cell outside the
 marker.
@@ -17,6 +19,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.prediction.frame import without_tails
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
 from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
 
@@ -35,6 +38,8 @@ _GRADIENTS, _OF_GAIN_CONTROL = slice(1, 3), slice(5, None)
 # Cumulative standard normal distribution, by a table.
 _FARTHEST = 6.0
 _Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
+# Weights of the corners in the middles of the top, left, bottom and right side.
+_MIDDLES = bilinear(np.array([0.5, 0.0, 0.5, 1.0]), np.array([0.0, 0.5, 1.0, 0.5]))
 _BELOW = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z.tolist()])
 
 
@@ -45,6 +50,8 @@ class PatternGrid(NamedTuple):
     along: FloatArray
     #: (4, P) of :func:`bilinear`
     weights: Float32Array
+    #: (2, P) parabolas along each axis that vanish at the corners
+    parabolas: Float32Array
     #: (P, 3 or 6) orthonormal backgrounds
     background: Float32Array
     #: (2, P) places from the middle, in sides, and their squared distances (P,) from there
@@ -72,7 +79,8 @@ def pattern_grid(cells: int, density: int, *, bent: bool = False) -> PatternGrid
     background = np.linalg.qr(np.stack([*linear, a * a, a * b, b * b] if bent else linear, axis=1))[0]
     weights, middle = bilinear(a, b).astype(np.float32), np.stack([a, b]).astype(np.float32) - np.float32(0.5)
     bowl = (middle * middle).sum(axis=0)
-    return PatternGrid(along, weights, background.astype(np.float32), middle, bowl, density, graded=not bent)
+    parabolas = np.stack([a * (1.0 - a), b * (1.0 - b)]).astype(np.float32)
+    return PatternGrid(along, weights, parabolas, background.astype(np.float32), middle, bowl, density, graded=not bent)
 
 
 class PatternView(NamedTuple):
@@ -85,10 +93,14 @@ class PatternView(NamedTuple):
     motion: FloatArray | None = None
     #: whether its values are a nonlinear function of the counts
     displayed: bool = False
+    #: (2, Q, 2) of :func:`lens_bends`; None: straight lines are straight in the image
+    bends: FloatArray | None = None
 
     def gray(self, quads: FloatArray, grid: PatternGrid) -> Float32Array:
         """Values (Q, P) at the samples of markers in ``quads`` (Q, 4, 2)."""
         places = seen_between(quads, grid.weights)
+        if self.bends is not None:
+            places += self.bends.astype(np.float32) @ grid.parabolas
         shown = self._at(places)
         if self.to_tails is not None:
             maps = self.to_tails.transpose(1, 2, 0)[..., None].astype(np.float32)
@@ -100,6 +112,17 @@ class PatternView(NamedTuple):
     def _at(self, places: Float32Array) -> Float32Array:
         shown = cv2.remap(self.image, places[0], places[1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(shown, dtype=np.float32)
+
+
+def lens_bends(corners: ImagePoints, camera: Camera) -> FloatArray:
+    """How the lens displaces what is between the corners (Q, 4) of markers, as amounts (2, Q, 2) of parabolas [px].
+
+    Those along the first axis are four times the mean displacement of the middles of the top and the bottom side.
+    """
+    middles = np.moveaxis(seen_between(corners.x, _MIDDLES), 0, -1)
+    seen = camera.distort(np.concatenate([corners.x, middles], axis=1))
+    off = np.moveaxis(seen[:, 4:], -1, 0) - seen_between(seen[:, :4], _MIDDLES)
+    return np.asarray(2.0 * (off[..., :2] + off[..., 2:]))
 
 
 class PatternModel(NamedTuple):

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corners.blurred_patterns import PatternView
+from thermal_fiducial.core.detection.corners.blurred_patterns import lens_bends, PatternView
 from thermal_fiducial.core.detection.corners.corner_errors import of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.corners.pattern_fit import fitted_patterns, too_small_for_sides
 from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
@@ -116,8 +116,10 @@ def _with_small(
 ) -> RefinedCorners:
     """Corners of N markers in the image: of ``small`` ones (N,) by the whole pattern, of the others by their sides."""
     moving, large = blur.only(small), ~small
-    view = PatternView(frame.image, moving.to_tails, moving.spread, frame.displayed)
-    fitted = fitted_patterns(frame, found.only(small), start.only(small), view, decoder, config.blur_px)
+    there = start.only(small)
+    bends = lens_bends(there, frame.camera)
+    view = PatternView(frame.image, moving.to_tails, moving.spread, frame.displayed, bends)
+    fitted = fitted_patterns(frame, found.only(small), there, view, decoder, config.blur_px)
     if small.all():
         return fitted
     by_sides = refine_corners(
