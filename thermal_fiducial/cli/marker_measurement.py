@@ -10,6 +10,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.se3 import narrow_sides
 from thermal_fiducial.core.measurements import columns, corners_px, Markers
 from thermal_fiducial.core.types import Counts, FloatArray, IntArray, SIGMA_OF_MEDIAN
 from thermal_fiducial.fabrication.planning import expected_errors, Measurements, pose_errors
@@ -30,9 +31,16 @@ _TIME = 13.0
 _SENSOR = replace(Sensor(), bad_pixel_share=0.0, lag=0.0)
 _MOST_MARKERS = 12
 # Largest number of views of one kind; a view has one or two large markers.
-_MOST_VIEWS = 4
-# Least number of poses for the scale of their errors.
+_MOST_VIEWS = 12
+# Largest side in a view from the front: such a marker and its warm border are in the image in any rotation.
+_LARGEST_PX = 240.0
+# Least number of poses on the right branch for their median error: exactly from the front there are few.
 _ENOUGH_POSES = 8
+# Number of poses from which the error of independent corners is taken.
+_SAMPLES = 200
+# Steps to the distance at which the narrowest side has a given length, which perspective changes by a twentieth, and to
+# the noise that makes a given error, which is all but proportional to it.
+_STEPS = 3
 
 
 @dataclass(frozen=True)
@@ -55,17 +63,24 @@ class View:
     corners_px: FloatArray
 
 
-def render_view(side_px: float, contrast: float, tilt_deg: float, rng: np.random.Generator) -> View:
+def render_view(
+    side_px: float, contrast: float, tilt_deg: float, rng: np.random.Generator, *, narrowest: bool = False
+) -> View:
     """Markers at random places of the image with random rotations, tilted by ``tilt_deg`` from the line of sight.
 
     Parameters
     ----------
     side_px : side of the black square in a view from the front
     contrast : [K]
+    narrowest : ``side_px`` is the narrowest side of each marker in the image instead
     """
     lens = LENSES[LENS]
     bits = load_dictionary(DICTIONARY).bits
-    T = np.stack([_place(lens, pixel, side_px, np.radians(tilt_deg), rng) for pixel in _places(lens, side_px, rng)])
+    tilt = np.radians(tilt_deg)
+    largest = side_px / np.cos(tilt) if narrowest else side_px
+    T = np.stack([_place(lens, pixel, side_px, tilt, rng) for pixel in _places(lens, largest, rng)])
+    if narrowest:
+        T = _with_narrowest_sides(lens, T, side_px)
     ids = rng.choice(len(bits), len(T), replace=False).tolist()
     plates = [_plate(pose, bits[marker_id], contrast) for pose, marker_id in zip(T, ids, strict=True)]
     still = SplineTrajectory(
@@ -75,9 +90,22 @@ def render_view(side_px: float, contrast: float, tilt_deg: float, rng: np.random
     quality = Quality(samples=97, warm_up=0)
     renderer = Renderer(lens, plates, room, Fog(), Acrylic(), still, np.eye(4), lag=0.0, quality=quality)
     counts = _SENSOR.counts(renderer.frame(_TIME), _TIME, 0, int(rng.integers(1 << 31)))
+    return View(int(rng.integers(1 << 60)), counts, ids, T, _corners_px(lens, T))
+
+
+def _corners_px(lens: Lens, T: FloatArray) -> FloatArray:
+    """True corners (N, 4, 2) of markers with poses (N, 4, 4)."""
     s = 0.5 * _SIZE
     corners = np.array([[-s, s, 0.0], [s, s, 0.0], [s, -s, 0.0], [-s, -s, 0.0]])
-    return View(int(rng.integers(1 << 60)), counts, ids, T, lens.project(se3.apply(T, corners)))
+    return lens.project(se3.apply(T, corners))
+
+
+def _with_narrowest_sides(lens: Lens, T: FloatArray, side_px: float) -> FloatArray:
+    """Poses (N, 4, 4) moved along the lines of sight to where the narrowest sides have ``side_px``."""
+    T = T.copy()
+    for _ in range(_STEPS):
+        T[:, :3, 3] *= narrow_sides(_corners_px(lens, T))[:, None] / side_px
+    return T
 
 
 def _places(lens: Lens, side_px: float, rng: np.random.Generator) -> Iterator[FloatArray]:
@@ -174,31 +202,36 @@ def show(
     tilt_deg: float,
     markers: int,
     seed: list[int],
+    *,
+    narrowest: bool = False,
 ) -> Tally:
-    """Run the detector on about ``markers`` markers of one kind."""
+    """Run the detector on about ``markers`` markers of one kind, see :func:`render_view`."""
     rng = np.random.default_rng(seed)
     shown, parts = 0, []
     for _ in range(_MOST_VIEWS):
         if shown >= markers:
             break
-        view = render_view(side_px, kelvin, tilt_deg, rng)
+        view = render_view(side_px, kelvin, tilt_deg, rng, narrowest=narrowest)
         rows, index = detect(view, detector, camera)
         parts.append((corners_px(rows) - view.corners_px[index], *both_poses(rows), view.T_camera_marker[index]))
         shown += len(view.ids)
     return Tally(shown, *(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-def _pose_factor(tally: Tally, camera: Camera, side_px: float, tilt_deg: float) -> float:
-    """Ratio of the poses' error to that of poses from independent corners; NaN for too few poses."""
-    if len(tally.best) < _ENOUGH_POSES:
+def _pose_sigma_px(tally: Tally, camera: Camera) -> float:
+    """Noise of independent corners whose poses are as good as those of ``tally``; NaN for too few of them."""
+    measured, _, _, wrong = pose_errors(tally.best, tally.other, tally.T_true)
+    if len(tally.best) * (1.0 - wrong) < _ENOUGH_POSES:
         return np.nan
-    measured = pose_errors(tally.best, tally.other, tally.T_true)[0]
-    distance = camera.focal_px * _SIZE / side_px
-    return measured / expected_errors(camera, _SIZE, distance, tilt_deg, tally.sigma_px, 1)[0]
+    T, sigma = tally.T_true[np.arange(_SAMPLES) % len(tally.T_true)], tally.sigma_px
+    for _ in range(_STEPS):
+        expected = expected_errors(camera, _SIZE, T, np.full(_SAMPLES, sigma), np.random.default_rng(1))[0]
+        sigma *= measured / expected
+    return sigma
 
 
 def measure(
-    side_px: FloatArray,
+    narrow_px: FloatArray,
     contrast: FloatArray,
     tilt_deg: FloatArray,
     *,
@@ -206,27 +239,17 @@ def measure(
     seed: int,
     progress: Callable[[float], None] | None = None,
 ) -> Measurements:
-    """Run the detector on about ``markers`` markers of each side, contrast (in NETD) and tilt."""
+    """Run the detector on about ``markers`` markers of each narrowest side, contrast (in NETD) and tilt."""
     camera, detector = camera_and_detector()
-    shape = (len(side_px), len(contrast), len(tilt_deg))
-    found, (sigma, off, factor) = np.zeros(shape), np.full((3, *shape), np.nan)
+    shape = (len(narrow_px), len(contrast), len(tilt_deg))
+    found, sigma, pose_sigma, off = np.full((4, *shape), np.nan)
     for done, node in enumerate(np.ndindex(*shape), 1):
-        side, kelvin, tilt = float(side_px[node[0]]), float(contrast[node[1]]) * _SENSOR.netd, float(tilt_deg[node[2]])
-        tally = show(detector, camera, side, kelvin, tilt, markers, [seed, *node])
-        found[node], sigma[node], off[node] = tally.found, tally.sigma_px, tally.distance_error
-        factor[node] = _pose_factor(tally, camera, side, tilt)
+        side, tilt = float(narrow_px[node[0]]), float(tilt_deg[node[2]])
+        kelvin = float(contrast[node[1]]) * _SENSOR.netd
+        if side <= _LARGEST_PX * np.cos(np.radians(tilt)):
+            tally = show(detector, camera, side, kelvin, tilt, markers, [seed, *node], narrowest=True)
+            found[node], sigma[node], off[node] = tally.found, tally.sigma_px, tally.distance_error
+            pose_sigma[node] = _pose_sigma_px(tally, camera)
         if progress is not None:
             progress(done / found.size)
-    return Measurements(side_px, contrast, tilt_deg, found, sigma, off, _over_sides(factor))
-
-
-def _over_sides(factor: FloatArray) -> FloatArray:
-    """Median (C, T) of factors (S, C, T); if nothing was found, that of the next higher contrast."""
-    medians = np.full(factor.shape[1:], np.nan)
-    for node in np.ndindex(*medians.shape):
-        values = factor[:, node[0], node[1]]
-        if np.any(np.isfinite(values)):
-            medians[node] = np.nanmedian(values)
-    for row in range(len(medians) - 2, -1, -1):
-        medians[row] = np.where(np.isfinite(medians[row]), medians[row], medians[row + 1])
-    return medians
+    return Measurements(narrow_px, contrast, tilt_deg, found, sigma, pose_sigma, off)

@@ -32,9 +32,9 @@ from thermal_fiducial.files.writing import new_file
 _PITCH_MM, _SHORTEST_MM = 0.017, 0.5
 _FADE_SECONDS = (0.0, 30.0, 60.0, 120.0, 300.0, 900.0, 3600.0)
 _STAND_OFFS_MM = (0.0, 0.5, 2.0, 5.0, 10.0, 20.0)
-# Sides [px] from the detector's min_side_px to a marker that fills the image, closer where tilted markers change from
-# one fit to the other; contrasts in NETD.
-_SIDES_PX = (12.0, 13.0, 15.0, 17.0, 20.0, 24.0, 30.0, 34.0, 40.0, 60.0, 100.0, 160.0)
+# Narrowest sides [px] from the detector's min_side_px to a marker that fills the image, and one on each side of where
+# the fit changes (``too_small_for_sides``: 23.8 px), as far from it as inaccurate first corners are; contrasts in NETD.
+_NARROW_PX = (12.0, 13.0, 15.0, 17.0, 20.0, 23.4, 24.2, 28.0, 34.0, 45.0, 70.0, 110.0, 160.0)
 _CONTRASTS = (1.0, 2.0, 4.0, 8.0, 20.0, 80.0, 300.0)
 _TILTS_DEG = (0.0, 30.0, 45.0, 55.0, 65.0, 75.0)
 
@@ -215,12 +215,11 @@ def _measure(args: argparse.Namespace) -> int:
     from thermal_fiducial.cli.marker_measurement import DICTIONARY, LENS, measure
 
     refuse_to_overwrite([args.out], args.force)
-    axes = np.array(_SIDES_PX), np.array(_CONTRASTS), np.array(_TILTS_DEG)
+    axes = np.array(_NARROW_PX), np.array(_CONTRASTS), np.array(_TILTS_DEG)
     with progress_bar('showing markers') as progress:
         measurements = measure(*axes, markers=args.markers, seed=args.seed, progress=progress)
     notes = {'dictionary': DICTIONARY, 'lens': LENS, 'markers': args.markers, 'seed': args.seed}
     save_measurements(args.out, measurements, notes)
-    print(
-        f'{args.out}: {int(np.sum(measurements.found >= DETECTED))} of {measurements.found.size} kinds of view detected'
-    )
+    detected, shown = np.sum(measurements.found >= DETECTED), np.sum(np.isfinite(measurements.found))
+    print(f'{args.out}: {detected} of {shown} kinds of view detected')
     return 0

@@ -2,8 +2,9 @@
 
 White noise averages out over the corners of a frame and over frames; a systematic error is the same for many of them
 and does not. Each is a field of :class:`SystematicErrors`; covariances of the map and of these poses are widened by the
-functions here and, for the lens, by those of ``lens_errors``, and nowhere else. Errors of single corners in a frame are in ``detection/corners/corner_errors.py``,
-those that the filter adds to its own model in ``filter/pose_noise.py`` and ``filter/imu_noise.py``.
+functions here and, for the lens, by those of ``lens_errors``, and nowhere else. Errors of single corners in a frame are
+in ``detection/corners/corner_errors.py``, those that the filter adds to its own model in ``filter/pose_noise.py`` and
+``filter/imu_noise.py``.
 
 An error that a frame shares with the next ones enters the covariance of a pose after the fit (as a consider parameter;
 S. Schmidt, 1966), never the weights frame by frame: weights that change with the markers in view would make the pose

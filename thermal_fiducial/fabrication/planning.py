@@ -1,11 +1,13 @@
 """Predicted detection rate and pose error of a marker, seen by a given camera.
 
 The predictions rest on measurements: ``measured.yaml`` holds results of this package's detector in rendered frames,
-over marker side in pixels, contrast and tilt (``thermal-fiducial markers measure`` measures them again). The share of
-markers found, the noise of the corners and the error of the distance are read from it. The other errors of the pose
-come from the pose solver, run on corners with that noise, with both planar branches, since linear propagation fails
-near front-parallel views. The distance is measured because the corners of small markers have, besides their noise, a
-common displacement, which scales the distance.
+over narrowest side in the image, contrast and tilt (``thermal-fiducial markers measure`` measures them again). The
+narrowest side says whether the detector finds a marker and how it fits it, so it is the axis, and a view of a given
+distance and tilt is a mean over the rotations of the marker, each with a narrowest side of its own. The share of
+markers found, the noise of the corners and the error of the distance are read from the tables. The other errors of the
+pose come from the pose solver, run on corners with the noise that gives the measured errors of poses, with both planar
+branches, since linear propagation fails near front-parallel views. The distance is measured because the corners of
+small markers have, besides their noise, a common displacement, which scales the distance.
 """
 
 from dataclasses import dataclass
@@ -22,6 +24,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
 from thermal_fiducial.core.geometry.reprojection import marker_corners
+from thermal_fiducial.core.geometry.se3 import narrow_sides
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.plain_yaml import load_plain
@@ -34,7 +37,7 @@ PACKAGED = Path(__file__).resolve().parent / 'measured.yaml'
 #: Share of measured markers found from which a marker counts as detected: four frames of five, 24 a second.
 DETECTED = 0.8
 
-_TABLES = ('side_px', 'contrast', 'tilt_deg', 'found', 'sigma_px', 'distance_error', 'pose_factor')
+_TABLES = ('narrow_px', 'contrast', 'tilt_deg', 'found', 'sigma_px', 'pose_sigma_px', 'distance_error')
 _SAMPLES = 200
 # Bits along a side of the measured markers; other markers are compared by the size of their cells.
 _MEASURED_BITS = 4
@@ -46,64 +49,80 @@ class Measurements:
 
     Parameters
     ----------
-    side_px : (S,) side of the black square in a view from the front
+    narrow_px : (S,) narrowest side of the black square in the image
     contrast : (C,) in standard deviations of the camera's temporal noise (NETD)
     tilt_deg : (T,) between the marker's normal and the line of sight
-    found : (S, C, T) share of the markers that were found
+    found : (S, C, T) share of the markers that were found; NaN where a marker does not fit into the image
     sigma_px : (S, C, T) noise of a corner coordinate; NaN where nothing was found
+    pose_sigma_px : (S, C, T) noise of independent corners whose poses are as good as those found: the errors of a
+        marker's corners are correlated, by common sides or by the fit of the whole pattern, which changes the pose more
+        or less than independent ones; NaN where nothing was found
     distance_error : (S, C, T) median relative error of the distance; NaN where nothing was found
-    pose_factor : (C, T) ratio of the median error of the poses to that of poses from corners with independent noise:
-        the corners of a marker lie on common sides, so their errors are correlated, most in faint markers
     """
 
-    side_px: FloatArray
+    narrow_px: FloatArray
     contrast: FloatArray
     tilt_deg: FloatArray
     found: FloatArray
     sigma_px: FloatArray
+    pose_sigma_px: FloatArray
     distance_error: FloatArray
-    pose_factor: FloatArray
 
-    def look_up(self, side_px: float, contrast: float, tilt_deg: float, bits: int = 4) -> tuple[float, float]:
-        """Share found and corner noise [px], interpolated.
+    def found_share(self, narrow_px: FloatArray, contrast: float, tilt_deg: float, bits: int = 4) -> FloatArray:
+        """Share of markers found (N,), for narrowest sides (N,), linear over the logarithms of side and contrast.
 
-        The share is linear over the logarithms of side and contrast. The noise is a power of the side in pixels as the
-        camera sees it, so its logarithm is linear over those of side and of the tilt's cosine. Its square is a floor,
-        from optics and from the fixed pattern, plus a part that falls with the square of the contrast. Beyond the
-        measured range the values of its ends hold, but markers that are smaller or fainter than measured, or have a
-        side below the detector's ``min_side_px`` in some rotation, count as not found.
+        Markers that are smaller or fainter than measured, or have a side below the detector's ``min_side_px``, count
+        as not found.
         """
-        shortest = side_px * np.sqrt(0.5 + 0.5 * np.cos(np.radians(tilt_deg)) ** 2)
-        if contrast < self.contrast[0] or shortest < ArucoDetectorConfig().min_side_px:
-            return 0.0, np.nan
-        faint, tilted = _position(np.log(self.contrast), np.log(contrast)), self._tilted(tilt_deg)
-        readable = side_px * (_MEASURED_BITS + 2) / (bits + 2)
-        found = 0.0
-        if readable >= self.side_px[0]:
-            found = _interpolate(self.found, (_position(np.log(self.side_px), np.log(readable)), faint, tilted))
-        large = _position(np.log(self.side_px), np.log(max(side_px, self.side_px[0])))
-        index, _ = faint
+        readable = narrow_px * (_MEASURED_BITS + 2) / (bits + 2)
+        index, share = self._faint(contrast)
+        at_tilt = self._tilted(self.found, tilt_deg)
+        found = self._along(_between(at_tilt[:, index], at_tilt[:, index + 1], share), readable)
+        refused = (readable < self.narrow_px[0]) | (narrow_px < ArucoDetectorConfig().min_side_px)
+        return np.where(refused | (contrast < self.contrast[0]), 0.0, found)
+
+    def noise_px(self, narrow_px: FloatArray, contrast: float, tilt_deg: float) -> FloatArray:
+        """``sigma_px`` (N,), for narrowest sides (N,)."""
+        return self._noise(self.sigma_px, narrow_px, contrast, tilt_deg)
+
+    def pose_noise_px(self, narrow_px: FloatArray, contrast: float, tilt_deg: float) -> FloatArray:
+        """``pose_sigma_px`` (N,), for narrowest sides (N,)."""
+        return self._noise(self.pose_sigma_px, narrow_px, contrast, tilt_deg)
+
+    def _noise(self, table: FloatArray, narrow_px: FloatArray, contrast: float, tilt_deg: float) -> FloatArray:
+        """Noise (N,) of a ``table`` (S, C, T).
+
+        It is a power of the side in pixels, so its logarithm is linear over those of side and of the tilt's cosine.
+        Its square is a floor, from optics and from the fixed pattern, plus a part that falls with the square of the
+        contrast. Beyond the measured range the values of its ends hold.
+        """
+        index, _ = self._faint(contrast)
         inverse = self.contrast[index : index + 2] ** -2.0
         share = float(np.clip((inverse[0] - contrast**-2.0) / (inverse[0] - inverse[1]), 0.0, 1.0))
-        ends = [_interpolate(np.log(self.sigma_px), (large, (index, end), tilted)) for end in (0.0, 1.0)]
-        if not np.all(np.isfinite(ends)):
-            return found, float(np.exp(_interpolate(np.log(self.sigma_px), (large, faint, tilted))))
-        variances = np.exp(2.0 * np.array(ends))
-        return found, float(np.sqrt((1.0 - share) * variances[0] + share * variances[1]))
+        at_tilt = self._tilted(np.log(table), tilt_deg)
+        fainter, clearer = (np.exp(2.0 * self._along(at_tilt[:, end], narrow_px)) for end in (index, index + 1))
+        return np.sqrt(_between(fainter, clearer, share))
 
-    def distance_share(self, side_px: float, contrast: float, tilt_deg: float) -> float:
-        """``distance_error``, interpolated: its logarithm is linear over those of the axes."""
-        large = _position(np.log(self.side_px), np.log(side_px))
-        faint = _position(np.log(self.contrast), np.log(contrast))
-        return float(np.exp(_interpolate(np.log(self.distance_error), (large, faint, self._tilted(tilt_deg)))))
+    def distance_share(self, narrow_px: FloatArray, contrast: float, tilt_deg: float) -> FloatArray:
+        """``distance_error`` (N,), for narrowest sides (N,): its logarithm is linear over those of the axes."""
+        index, share = self._faint(contrast)
+        at_tilt = self._tilted(np.log(self.distance_error), tilt_deg)
+        return np.exp(self._along(_between(at_tilt[:, index], at_tilt[:, index + 1], share), narrow_px))
 
-    def factor(self, contrast: float, tilt_deg: float) -> float:
-        """``pose_factor``, interpolated."""
-        faint = _position(np.log(self.contrast), np.log(contrast))
-        return _interpolate(self.pose_factor[None].repeat(2, axis=0), ((0, 0.0), faint, self._tilted(tilt_deg)))
+    def _faint(self, contrast: float) -> tuple[int, float]:
+        return _position(np.log(self.contrast), np.log(contrast))
 
-    def _tilted(self, tilt_deg: float) -> tuple[int, float]:
-        return _position(-np.log(np.cos(np.radians(self.tilt_deg))), -np.log(np.cos(np.radians(tilt_deg))))
+    def _tilted(self, table: FloatArray, tilt_deg: float) -> FloatArray:
+        """A ``table`` (..., T) at a tilt."""
+        index, share = _position(-np.log(np.cos(np.radians(self.tilt_deg))), -np.log(np.cos(np.radians(tilt_deg))))
+        return _between(table[..., index], table[..., index + 1], share)
+
+    def _along(self, values: FloatArray, narrow_px: FloatArray) -> FloatArray:
+        """Those of ``values`` (S,) that there are, between the measured sides."""
+        known = np.isfinite(values)
+        if not np.any(known):
+            return np.full(np.shape(narrow_px), np.nan)
+        return np.interp(np.log(narrow_px), np.log(self.narrow_px[known]), values[known])
 
 
 def _position(axis: FloatArray, value: float) -> tuple[int, float]:
@@ -112,17 +131,10 @@ def _position(axis: FloatArray, value: float) -> tuple[int, float]:
     return index, float(np.clip((value - axis[index]) / (axis[index + 1] - axis[index]), 0.0, 1.0))
 
 
-def _interpolate(table: FloatArray, positions: tuple[tuple[int, float], ...]) -> float:
-    """Interpolate linearly between the corners of a cell; corners without a value are left out."""
-    total, weights = 0.0, 0.0
-    for corner in np.ndindex(2, 2, 2):
-        weight = float(
-            np.prod([share if side else 1.0 - share for side, (_, share) in zip(corner, positions, strict=True)])
-        )
-        value = table[tuple(index + side for side, (index, _) in zip(corner, positions, strict=True))]
-        if weight > 0.0 and np.isfinite(value):
-            total, weights = total + weight * float(value), weights + weight
-    return total / weights if weights > 0.0 else np.nan
+def _between(one: FloatArray, other: FloatArray, share: float) -> FloatArray:
+    """Interpolate linearly; where one has no value, that of the other holds."""
+    mixed = (1.0 - share) * one + share * other
+    return np.where(np.isfinite(mixed), mixed, np.where(np.isfinite(one), one, other))
 
 
 def load_measurements(path: str | os.PathLike[str] = PACKAGED) -> Measurements:
@@ -141,9 +153,8 @@ def load_measurements(path: str | os.PathLike[str] = PACKAGED) -> Measurements:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f'{path}: {one_line(error)} is missing or no table') from None
     measurements = Measurements(*tables)
-    shape = len(measurements.side_px), len(measurements.contrast), len(measurements.tilt_deg)
-    sized = (measurements.found, measurements.sigma_px, measurements.distance_error)
-    if any(table.shape != shape for table in sized) or tables[-1].shape != shape[1:] or min(shape) < 2:
+    shape = len(measurements.narrow_px), len(measurements.contrast), len(measurements.tilt_deg)
+    if any(table.shape != shape for table in tables[3:]) or min(shape) < 2:
         raise InputError(f'{path}: tables of {[table.shape for table in tables[3:]]} do not fit axes of {shape}')
     return measurements
 
@@ -173,7 +184,7 @@ class Expectation:
 
     side_px: float
     found: float
-    sigma_px: float
+    sigma_px: float = np.nan
     position: float = np.nan
     distance: float = np.nan
     rotation_deg: float = np.nan
@@ -209,27 +220,39 @@ def expect(
     if not (size > 0.0 and distance > size and 0.0 <= tilt_deg < 85.0 and contrast > 0.0):
         raise InputError(f'side {size:g} m, distance {distance:g} m, tilt {tilt_deg:g} deg cannot be planned')
     side_px = camera.focal_px * size / distance
-    found, sigma = measurements.look_up(side_px, contrast, tilt_deg, bits)
-    if not np.isfinite(sigma):
-        return Expectation(side_px, found, sigma)
-    errors = expected_errors(camera, size, distance, tilt_deg, sigma, seed)
-    factor = measurements.factor(contrast, tilt_deg)
-    along = distance * measurements.distance_share(side_px, contrast, tilt_deg)
-    position, rotation = factor * errors[0], factor * errors[2]
-    return Expectation(side_px, found, sigma, max(position, along), along, rotation, errors[3])
+    rng = np.random.default_rng(seed)
+    T = viewed_at(distance, np.radians(tilt_deg), rng.uniform(0.0, 2.0 * np.pi, _SAMPLES), camera)
+    narrow_px = narrow_sides(camera.project(se3.apply(T, marker_corners(size))))
+    found = measurements.found_share(narrow_px, contrast, tilt_deg, bits)
+    share = float(found.mean())
+    if share == 0.0:
+        return Expectation(side_px, share)
+    seen = rng.choice(_SAMPLES, _SAMPLES, p=found / found.sum())
+    view = narrow_px[seen], contrast, tilt_deg
+    pose_sigma = measurements.pose_noise_px(*view)
+    if not np.all(np.isfinite(pose_sigma)):
+        return Expectation(side_px, share)
+    position, _, rotation_deg, wrong = expected_errors(camera, size, T[seen], pose_sigma, rng)
+    # The mean of logarithms: the median over markers of different errors is between those of each.
+    along = distance * float(np.exp(np.mean(np.log(measurements.distance_share(*view)))))
+    noise = float(np.sqrt(np.mean(measurements.noise_px(*view) ** 2)))
+    return Expectation(side_px, share, noise, max(position, along), along, rotation_deg, wrong)
 
 
 def expected_errors(
-    camera: Camera, size: float, distance: float, tilt_deg: float, sigma_px: float, seed: int
+    camera: Camera, size: float, T: FloatArray, sigma_px: FloatArray, rng: np.random.Generator
 ) -> tuple[float, float, float, float]:
-    """Errors as of :func:`pose_errors`, for corners with independent noise of ``sigma_px``."""
-    rng = np.random.default_rng(seed)
-    turned = rng.uniform(0.0, 2.0 * np.pi, _SAMPLES)
-    T = viewed_at(distance, np.radians(tilt_deg), turned, camera)
+    """Errors as of :func:`pose_errors`, for corners with independent noise.
+
+    Parameters
+    ----------
+    T : (N, 4, 4) T_camera_marker
+    sigma_px : (N,) noise of a coordinate
+    """
     corners = camera.project(se3.apply(T, marker_corners(size)))
-    noisy = corners + rng.normal(0.0, sigma_px, corners.shape)
-    covariances = np.broadcast_to(sigma_px**2 * np.eye(2), (*corners.shape, 2))
-    poses = solve_marker_poses(noisy, covariances, np.full(_SAMPLES, size), camera)
+    noisy = corners + sigma_px[:, None, None] * rng.standard_normal(corners.shape)
+    covariances = np.broadcast_to((sigma_px**2)[:, None, None, None] * np.eye(2), (*corners.shape, 2))
+    poses = solve_marker_poses(noisy, covariances, np.full(len(T), size), camera)
     return pose_errors(poses.T_camera_marker[:, 0], poses.T_camera_marker[:, 1], T)
 
 

@@ -240,6 +240,11 @@ def sides_px(quads: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(squared_sides(quads)).mean(axis=1))
 
 
+def narrow_sides(quads: FloatArray) -> FloatArray:
+    """Narrowest sides (Q,) of quadrilaterals (Q, 4, 2)."""
+    return np.asarray(np.sqrt(squared_sides(quads).min(axis=1)))
+
+
 def diagonals(quads: FloatArray) -> FloatArray:
     """Lengths (Q,) of the diagonals of quadrilaterals (Q, 4, 2) from their first corners."""
     return np.asarray(np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1))

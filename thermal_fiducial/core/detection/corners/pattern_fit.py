@@ -33,7 +33,7 @@ from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.prediction.frame import Frame
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry.camera import ImagePoints
-from thermal_fiducial.core.geometry.se3 import diagonals, sides_px, squared_sides
+from thermal_fiducial.core.geometry.se3 import diagonals, narrow_sides, sides_px, squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY
 
 # Bound on the number of false markers in a picture, were all of it squares with a black border around random bits.
@@ -126,8 +126,7 @@ def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> B
 
     Of a marker that is turned away the cells are narrow along one direction only, and that is what counts.
     """
-    narrowest = np.sqrt(squared_sides(corners_px).min(axis=1))
-    return np.asarray(narrowest < _NARROW * blur_px * cells)
+    return np.asarray(narrow_sides(corners_px) < _NARROW * blur_px * cells)
 
 
 def fitted_patterns(
