@@ -168,14 +168,24 @@ def seen_from(pose: CameraPose, T_camera_other: FloatArray) -> CameraPose:
 
 
 def intersection(first: CameraPose, second: CameraPose) -> CameraPose | None:
-    """Both poses of one instant as one, each with half its information; None where they contradict each other."""
+    """Both poses of one instant as one, each with half its information; None where they contradict each other.
+
+    Half of each bounds the covariance for any correlation of their errors (S. Julier, J. Uhlmann, "A non-divergent
+    estimation algorithm in the presence of unknown correlations", 1997), that of the map's errors in them, too.
+    """
     apart = difference(second.T_map_camera, first.T_map_camera)
     if apart @ np.linalg.solve(first.covariance + second.covariance, apart) > CHI2_OF_POSE:
         return None
     informations = [0.5 * np.linalg.inv(pose.covariance) for pose in (first, second)]
     covariance = np.linalg.inv(informations[0] + informations[1])
-    T_map_camera = retract(first.T_map_camera, covariance @ informations[1] @ apart)
-    return replace(first, T_map_camera=T_map_camera, covariance=0.5 * (covariance + covariance.T))
+    gains = [covariance @ information for information in informations]
+    bounds = [2.0 * G @ pose.map_covariance @ G.T for G, pose in zip(gains, (first, second), strict=True)]
+    return replace(
+        first,
+        T_map_camera=retract(first.T_map_camera, gains[1] @ apart),
+        covariance=0.5 * (covariance + covariance.T),
+        map_covariance=bounds[0] + bounds[1],
+    )
 
 
 def moved_by_odometry(pose: CameraPose, stamp_ns: int, middle: PredictedCamera | None) -> CameraPose | None:

@@ -1,6 +1,10 @@
 """A second camera: its poses join those of the first, or stand in for them."""
 
+from dataclasses import replace
+
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
@@ -71,6 +75,24 @@ def test_simultaneous_poses_are_weighted_by_covariance_and_claim_no_less_than_th
     # A hundred to one.
     np.testing.assert_allclose(joint.T_map_camera[:2, 3], [0.02 * 100 / 101, 0.02 / 101], rtol=1e-9)
     np.testing.assert_allclose(np.diag(joint.covariance)[:3], [2e-2 / 101, 2e-2 / 101, 1e-4], rtol=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(-3.0, 3.0))
+def test_the_map_s_share_of_a_joint_pose_is_a_part_of_its_covariance(seed, decades):
+    """Whatever share it is of either: else the filter takes the joint pose for exact in some directions."""
+    rng, poses = np.random.default_rng(seed), []
+    for scale in (1.0, 10.0**decades):
+        of_map, own = scale * 1e-2 * rng.normal(size=(2, 6, 6))
+        of_map, own = of_map @ of_map.T, own @ own.T + 1e-9 * np.eye(6)
+        poses.append(CameraPose(0, np.eye(4), of_map + own, of_map))
+    joint = intersection(*poses)
+    size = np.trace(joint.covariance)
+    # To rounding.
+    assert np.linalg.eigvalsh(joint.map_covariance)[0] > -1e-9 * size
+    assert np.linalg.eigvalsh(joint.covariance - joint.map_covariance)[0] > -1e-9 * size
+    # Of two poses on the map alone the joint one is, too.
+    bare = intersection(*(replace(pose, covariance=pose.map_covariance + 1e-12 * np.eye(6)) for pose in poses))
+    np.testing.assert_allclose(bare.map_covariance, bare.covariance, rtol=1e-2, atol=1e-9 * size)
 
 
 def test_poses_that_contradict_each_other_are_not_joined():
