@@ -119,16 +119,22 @@ class NewMarkers:
     def __init__(self, size: float, sizes: Mapping[int, float]) -> None:
         self._size, self._sizes = size, sizes
         self.candidates: dict[int, Candidate] = {}
+        #: that all views are of
+        self._camera: Camera | None = None
 
     def show(
         self, stamp_ns: int, seen: Observations, camera: Camera, viewpoint: Viewpoint, errors: SystematicErrors
     ) -> tuple[list[MapMarker], dict[int, str]]:
         """Add a frame's views to the candidates, except markers without a pose.
 
+        With another calibration they begin anew: the pixels of earlier views mean other directions in it.
+
         Returns
         -------
         Markers to enter the map, now determined by their views, and what the others wait for, in words by ID.
         """
+        if self._camera is None or not camera.matches(self._camera):
+            self._camera, self.candidates = camera, {}
         shown = []
         posed = np.isfinite(seen.branches[:, 0]).all(axis=(1, 2))
         for i, marker_id in zip(np.flatnonzero(posed).tolist(), seen.ids[posed].tolist(), strict=True):

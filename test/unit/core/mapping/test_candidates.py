@@ -9,8 +9,9 @@ from support.small_bag import CAMERA as STRAIGHT
 from thermal_fiducial.core.error_model import covariance_of, DRAWS, NO_DRAWS, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
-from thermal_fiducial.core.mapping.candidates import Candidate
+from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers
 from thermal_fiducial.core.mapping.marker_views import MarkerView, Viewpoint
+from thermal_fiducial.core.measurements import Observations
 
 # What lies far beside the axis a lens with distortion throws farthest.
 CAMERA = replace(STRAIGHT, D=np.array([-0.3, 0.12, 0.0, 0.0, -0.02]))
@@ -38,6 +39,20 @@ def test_a_start_through_a_camera_is_no_marker(gap):
     reason = candidate.place(CAMERA, SystematicErrors())
     assert isinstance(reason, str)
     assert 'marker 7' in reason
+
+
+def test_views_of_another_calibration_are_forgotten():
+    """A camera that is calibrated anew in flight: pixels of before mean other directions."""
+    new = NewMarkers(SIZE, {})
+    other = replace(CAMERA, K=CAMERA.K * [[1.025, 1.0, 1.0], [1.0, 1.025, 1.0], [1.0, 1.0, 1.0]])
+    for k, camera in enumerate((CAMERA, CAMERA, other, other)):
+        # 3 degrees apart, so that each is kept.
+        own = view(k, transform(so3_exp([0.05 * k, 0.0, 0.0]), np.zeros(3)))
+        shown = Observations(
+            np.array([7]), own.corners[None], own.corner_covariances[None], np.zeros(1), own.branches[None]
+        )
+        new.show(k, shown, camera, own.viewpoint, SystematicErrors())
+        assert len(new.candidates[7].views) == (k % 2) + 1
 
 
 def seen_from(x, draws):
