@@ -35,6 +35,8 @@ DECISIVE = 20.0
 WIDE = np.deg2rad(25.0)
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.
 _PROPOSERS = 4
+# Standard deviation of a rotation beyond which nothing is known of it, and its linearisation means nothing [rad].
+_NOTHING_KNOWN = 1.0
 
 
 def locate(
@@ -80,7 +82,8 @@ def _either(frame: '_JointFit', found: Location, T_other: FloatArray, prior: Flo
         pose = replace(pose, covariance=pose.covariance + spread)
         return replace(found, pose=pose, noise=found.noise + spread)
     other = frame.refined(T_other, frame.sight.reprojected(frame.camera, T_other), found.weights)
-    if other is None:
+    # One that hardly fits at all ends anywhere.
+    if other is None or np.sqrt(np.trace(other.pose.covariance[3:, 3:])) > _NOTHING_KNOWN:
         return found
     if prior is None:
         both = Viewpoint.either(found.viewpoint, other.viewpoint)
