@@ -73,14 +73,15 @@ class _Known(NamedTuple):
 def _good_of_larger(image: Float32Array, search: GridSearch, appearance: Appearance) -> Recognised | None:
     """Rows and pixels of the points that look like the board's, of a refused grid that covers most of it.
 
-    Its points beyond the board are judged by those of the board: in a row of clutter each is as faint as the others.
+    Its points beyond the board are expected to have the contrast of the board's: in a row of clutter each is as faint
+    as the others. Where they lie, they show themselves: beyond a board seen steeply nothing else does.
     """
     seen, grid = search.placed, search.refused
     if grid is None or grid.refusal.placed is None or (seen and len(seen.points) >= grid.refusal.covered):
         return None
     nodes = grid.nodes.astype(np.float64)
     of_board = np.isin(np.arange(len(nodes)), grid.refusal.placed.rows)
-    pixels = refine(image, nodes, grid.pixels, nodes, appearance, grid=of_board).pixels
+    pixels = refine(image, nodes, grid.pixels, nodes, appearance, typical=of_board).pixels
     good = np.flatnonzero(np.isfinite(pixels[:, 0]))
     return Recognised(good, pixels[good])
 

@@ -52,6 +52,7 @@ def refine(
     appearance: Appearance,
     *,
     grid: BoolArray | None = None,
+    typical: BoolArray | None = None,
 ) -> Refined:
     """Refine the points of a board.
 
@@ -61,6 +62,7 @@ def refine(
     pixels : (N, 2) initial pixels, to within a few pixels or a tenth of their spacing
     board : (M, 2) places of all points of the board
     grid : (N,) mask of the points that define the grid; the others may not belong to it. None: all
+    typical : (N,) mask of those whose contrast predicts that of all. None: all
     """
     appearance = appearance.at(nodes, board)
     every = np.arange(len(nodes))
@@ -81,7 +83,8 @@ def refine(
     if np.sum(np.isfinite(alike.contrast)) < _LEAST_POINTS:
         return Refined(lost, *known)
     pixels = _next_starts(nodes, pixels, alike.pixels, every, grid)
-    refined = _round(image, nodes, pixels, appearance, every, grid, shared, alike.contrast)
+    contrast = _Contrast(alike.contrast, np.ones_like(grid) if typical is None else typical)
+    refined = _round(image, nodes, pixels, appearance, every, grid, shared, contrast)
     # Points whose windows hold something else too, the border of the board or a hand.
     noise = float(np.sqrt(np.nanmedian(refined.variance))) if np.any(np.isfinite(refined.variance)) else 0.0
     odd = np.flatnonzero(refined.variance > _ODD * noise**2)
@@ -89,7 +92,7 @@ def refine(
         others = refined.pixels.copy()
         others[odd] = np.nan
         pixels = _next_starts(nodes, pixels, others, every, grid)
-        again = _round(image, nodes, pixels, appearance, odd, grid, shared, alike.contrast, noise)
+        again = _round(image, nodes, pixels, appearance, odd, grid, shared, contrast, noise)
         for values, new in zip(refined, again, strict=True):
             values[odd] = new[odd]
     enough = np.sum(np.isfinite(refined.contrast)) >= _LEAST_POINTS
@@ -102,6 +105,13 @@ def blur_of(image: Float32Array, nodes: FloatArray, pixels: FloatArray, appearan
     fits = _sampled(image, nodes, pixels, appearance.at(nodes, nodes), every, _FEW).fits
     found = np.isfinite(fits.contrast)
     return float(np.exp(np.median(fits.log_blur[found]))) if np.sum(found) >= _LEAST_POINTS else np.nan
+
+
+class _Contrast(NamedTuple):
+    """Contrast of points (N,), NaN where lost, and mask (N,) of those that predict it for the others."""
+
+    measured: FloatArray
+    typical: BoolArray
 
 
 class _Sample(NamedTuple):
@@ -153,11 +163,11 @@ def _round(
     index: IntArray,
     grid: BoolArray,
     shared: Shared | None,
-    contrast: FloatArray | None,
+    contrast: _Contrast | None,
     noise: float | None = None,
 ) -> PointFits:
     """Fit points ``index`` once; with ``contrast``, points without one are lost and not used for the ``grid``."""
-    known = grid if contrast is None else grid & np.isfinite(contrast)
+    known = grid if contrast is None else grid & np.isfinite(contrast.measured)
     ridge = ROUGHLY if shared is None else CLOSELY
     fits = PointFits(np.full_like(pixels, np.nan), *np.full((4, len(nodes)), np.nan))
     for first in range(0, len(index), _POINTS_AT_A_TIME):
@@ -166,7 +176,8 @@ def _round(
         blur = None if shared is None else np.exp(shared.log_blur[part])
         windows = windows_around(image, pixels[part], surfaces, appearance.rows(part), blur)
         if contrast is not None:
-            windows = with_expected_contrast(windows, nodes[part], nodes[known], contrast[known])
+            like = known & contrast.typical
+            windows = with_expected_contrast(windows, nodes[part], nodes[like], contrast.measured[like])
         for some in _few_pixels(windows):
             points = part[some.index]
             common = None if shared is None else Shared(*(values[points] for values in shared))

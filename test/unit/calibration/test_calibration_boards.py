@@ -257,6 +257,14 @@ def test_outer_corners_of_squares_beside_a_hot_border_make_no_larger_board():
     assert np.sqrt(np.mean(error**2)) < 0.05
 
 
+def test_a_larger_grid_before_a_lamp_is_refused():
+    """Three dots of another column among five points beyond: where they are, the others do not show well enough."""
+    heat = Heat(contrast=2.0, lamp=15.0)
+    counts, _ = picture(SYMMETRIC.points[:, :2], heat, np.random.default_rng(3), radius=0.27, fill=0.75)
+    with pytest.raises(BoardNotFound, match='3 more points'):
+        CircleGrid(6, 5, 1.0, 0.54, asymmetric=False).find(counts, GUESS)
+
+
 @pytest.mark.parametrize('contrast', [6.0, -6.0])
 def test_the_first_grid_that_is_grown_is_the_board(monkeypatch, contrast):
     """Neither the gaps between dots, nor edges of dots at finer scales are tried before the dots."""
