@@ -89,14 +89,19 @@ def refine(
     noise = float(np.sqrt(np.nanmedian(refined.variance))) if np.any(np.isfinite(refined.variance)) else 0.0
     odd = np.flatnonzero(refined.variance > _ODD * noise**2)
     if len(odd):
-        others = refined.pixels.copy()
-        others[odd] = np.nan
-        pixels = _next_starts(nodes, pixels, others, every, grid)
-        again = _round(image, nodes, pixels, appearance, odd, grid, shared, contrast, noise)
+        starts = _next_starts(nodes, pixels, _without(refined.pixels, odd), every, grid)
+        again = _round(image, nodes, starts, appearance, odd, grid, shared, contrast, noise)
         for values, new in zip(refined, again, strict=True):
             values[odd] = new[odd]
     enough = np.sum(np.isfinite(refined.contrast)) >= _LEAST_POINTS
     return Refined(refined.pixels if enough else lost, *known)
+
+
+def _without(pixels: FloatArray, lost: IntArray) -> FloatArray:
+    """Pixels (N, 2) with NaN at the indices ``lost``."""
+    left = pixels.copy()
+    left[lost] = np.nan
+    return left
 
 
 def blur_of(image: Float32Array, nodes: FloatArray, pixels: FloatArray, appearance: Appearance) -> float:
