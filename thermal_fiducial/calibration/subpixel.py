@@ -67,8 +67,8 @@ def refine(
     appearance = appearance.at(nodes, board)
     every = np.arange(len(nodes))
     grid = np.ones(len(nodes), dtype=np.bool_) if grid is None else grid
-    first = _sampled(image, nodes, pixels, appearance, grid)
-    found, lost = np.isfinite(first.fits.contrast), np.full_like(pixels, np.nan)
+    first, lost = _sampled(image, nodes, pixels, appearance, grid), np.full_like(pixels, np.nan)
+    found = np.isfinite(first.fits.contrast)
     if np.sum(found) < _LEAST_POINTS:
         return Refined(lost, appearance.width, np.inf, np.nan)
     appearance, alone = first.appearance, first.fits
@@ -85,10 +85,9 @@ def refine(
     pixels = _next_starts(nodes, pixels, alike.pixels, every, grid)
     contrast = _Contrast(alike.contrast, np.ones_like(grid) if typical is None else typical)
     refined = _round(image, nodes, pixels, appearance, every, grid, shared, contrast)
-    # Points whose windows hold something else too, the border of the board or a hand.
     noise = float(np.sqrt(np.nanmedian(refined.variance))) if np.any(np.isfinite(refined.variance)) else 0.0
-    odd = np.flatnonzero(refined.variance > _ODD * noise**2)
-    if len(odd):
+    # Points whose windows hold something else too, the border of the board or a hand.
+    if len(odd := np.flatnonzero(refined.variance > _ODD * noise**2)):
         starts = _next_starts(nodes, pixels, _without(refined.pixels, odd), every, grid)
         again = _round(image, nodes, starts, appearance, odd, grid, shared, contrast, noise)
         for values, new in zip(refined, again, strict=True):
