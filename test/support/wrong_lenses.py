@@ -1,5 +1,7 @@
 """Lenses whose calibration is off by a smooth random function of the place in the image, and flights behind them."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from support import walls
@@ -64,6 +66,43 @@ def _nees(off, covariance):
     return float(off @ np.linalg.solve(covariance, off)) / 6.0
 
 
+def _errors_of(located):
+    """Squared errors and claims (n,) of positions [m^2], and NEES per degree of freedom, of true poses and poses."""
+    off = [(difference(pose.T_map_camera, T), pose.covariance) for T, pose in located]
+    squared = [d[:3] @ d[:3] for d, _ in off]
+    return squared, [np.trace(P[:3, :3]) for _, P in off], [_nees(d, P) for d, P in off]
+
+
+def _flown(seed, lens_px, frames, marker_map=None):
+    """The mapper after a flight along a corridor behind a lens that is off by ``lens_px``.
+
+    Parameters
+    ----------
+    marker_map : of an earlier flight there, on which this one localizes; default: mapping from one marker
+
+    Returns
+    -------
+    The mapper, true poses of the markers, and of the located frames true poses of the camera and its poses.
+    """
+    rng = np.random.default_rng(seed)
+    lens, (poses, camera) = drawn_lens(rng, lens_px), _corridor(rng)
+    config, step = replace(_CONFIG, mode='mapping' if marker_map is None else 'localization'), 2
+    if marker_map is not None:
+        # The same lens and corridor, other noise.
+        rng, step = np.random.default_rng(1000 + seed), 5
+    mapper = MarkerMapper(config, marker_map or MarkerMap({0: MapMarker(0, walls.SIZE, True, poses[0])}))
+    located = []
+    for k in range(0, frames, step):
+        T, stamp = camera(k), walls.stamp(k)
+        rows = through(lens, walls.see(T, poses, _SIGMA_PX, rng), _SIGMA_PX)
+        pose = mapper.process(stamp, rows, walls.CAMERA, _odometry(stamp, T, rng)).pose
+        if pose is not None and k > 60:
+            located.append((T, pose))
+        if mapper.refinement_due(stamp):
+            mapper.refine(VIEWS)
+    return mapper, poses, located
+
+
 def bent_corridor(seed, lens_px, frames):
     """A map that grows along a corridor from one marker, behind a lens that is off by ``lens_px``.
 
@@ -71,20 +110,22 @@ def bent_corridor(seed, lens_px, frames):
     -------
     Rms error of the markers [m]; NEES per degree of freedom of the map in the end, and of the poses while it grew.
     """
-    rng = np.random.default_rng(seed)
-    lens, (poses, camera) = drawn_lens(rng, lens_px), _corridor(rng)
-    mapper = MarkerMapper(_CONFIG, MarkerMap({0: MapMarker(0, walls.SIZE, True, poses[0])}))
-    of_poses = []
-    for k in range(0, frames, 2):
-        T, stamp = camera(k), walls.stamp(k)
-        rows = through(lens, walls.see(T, poses, _SIGMA_PX, rng), _SIGMA_PX)
-        pose = mapper.process(stamp, rows, walls.CAMERA, _odometry(stamp, T, rng)).pose
-        if pose is not None and k > 60:
-            of_poses.append(_nees(difference(pose.T_map_camera, T), pose.covariance))
-        if mapper.refinement_due(stamp):
-            mapper.refine(VIEWS)
+    mapper, poses, located = _flown(seed, lens_px, frames)
     mapper.refine(VIEWS)
     markers = [marker for key, marker in mapper.map.markers.items() if key]
     of_map = [_nees(difference(m.T_map_marker, poses[m.id]), m.covariance) for m in markers]
     off = [np.linalg.norm(difference(m.T_map_marker, poses[m.id])[:3]) for m in markers]
-    return np.sqrt(np.mean(np.square(off))), np.mean(of_map), np.mean(of_poses)
+    return np.sqrt(np.mean(np.square(off))), np.mean(of_map), np.mean(_errors_of(located)[2])
+
+
+def corridor_again(seed, lens_px, frames):
+    """A second flight along such a corridor, on the map of the first.
+
+    Returns
+    -------
+    Mean squared errors and claims of positions [m^2], and NEES per degree of freedom.
+    """
+    mapper, _, _ = _flown(seed, lens_px, frames)
+    mapper.refine(VIEWS)
+    _, _, located = _flown(seed, lens_px, frames, mapper.map)
+    return np.mean(_errors_of(located), axis=1)
