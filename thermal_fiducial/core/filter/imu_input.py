@@ -1,5 +1,6 @@
 """Checks of IMU samples at the filter's input: finite, in range, not frozen, stamps in order and on one clock."""
 
+from dataclasses import dataclass
 from enum import Enum
 import math
 
@@ -36,6 +37,15 @@ class Verdict(Enum):
     BACKWARD = Condition('IMU stamp went back')
     AHEAD = Condition('IMU stamp jumped ahead')
     RESTART = Condition('IMU clock jumped', 'reset')
+
+
+@dataclass
+class StrayRun:
+    """Samples in a row whose stamps do not follow those before them, but each other."""
+
+    first_ns: int
+    last_ns: int
+    count: int = 1
 
 
 class Axis:
@@ -77,8 +87,8 @@ class ImuInput:
         saturated = [math.inf] * 3 + [SATURATED_SECONDS] * 3
         self._axes = [Axis(*of_axis) for of_axis in zip(ranges, saturated, strict=True)]
         self._last_ns: int | None = None
-        self._stray_ns = self._first_stray_ns = 0
-        self._strays = 0
+        #: since the last sample that was used; None: no sample
+        self._strays: StrayRun | None = None
         #: longest recent step [ns]
         self._longest_ns = 0.0
         #: longest step [ns] that is accepted at once, without waiting for a sample that follows
@@ -116,21 +126,22 @@ class ImuInput:
         if 0 < step_ns <= self._max_gap_ns:
             self._longest_ns = max(self._longest_ns * (1.0 - step_ns / MEMORY_NS), step_ns)
             self._usual_ns = min(max(UNUSUAL_FACTOR * self._longest_ns, GAP_NS), self._max_gap_ns)
-        self._last_ns, self._strays, self.jump_ns = stamp_ns, 0, jump_ns
+        self._last_ns, self._strays, self.jump_ns = stamp_ns, None, jump_ns
 
     def _stray(self, stamp_ns: int) -> Verdict:
         assert self._last_ns is not None
-        if not 0 < stamp_ns - self._stray_ns <= self._max_gap_ns:
-            self._strays, self._first_stray_ns = 0, stamp_ns
-        self._strays += 1
-        self._stray_ns = stamp_ns
-        jump_ns = self._first_stray_ns - self._last_ns
+        run = self._strays
+        if run is None or not 0 < stamp_ns - run.last_ns <= self._max_gap_ns:
+            run = self._strays = StrayRun(stamp_ns, stamp_ns)
+        else:
+            run.last_ns, run.count = stamp_ns, run.count + 1
+        jump_ns = run.first_ns - self._last_ns
         if 0 < jump_ns <= self._max_gap_ns:
-            if self._strays < GAP_EVIDENCE:
+            if run.count < GAP_EVIDENCE:
                 return Verdict.AHEAD
             self._follow(stamp_ns, jump_ns)
             return Verdict.USE
-        if self._strays < CLOCK_EVIDENCE:
+        if run.count < CLOCK_EVIDENCE:
             return Verdict.BACKWARD if jump_ns < 0 else Verdict.AHEAD
         self._follow(stamp_ns, jump_ns)
         return Verdict.RESTART

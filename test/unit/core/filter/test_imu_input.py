@@ -103,3 +103,29 @@ def test_the_end_of_a_gap_is_measured_from_its_first_sample(imu):
     # Three samples prove that it is the end of a gap; the gap ends with the first of them.
     found = excesses(imu, [*range(0, 500, 5), 535, 540, 545, 550])
     assert found[-4:] == pytest.approx([0.0, 0.0, 35.0, 0.0], abs=0.05)
+
+
+def stamped(imu, noise, stamps_ns):
+    """Verdicts on samples of noise with these stamps."""
+    readings = noise(len(stamps_ns))
+    return [imu.judge(ImuSample(ns, row[:3], row[3:])) for ns, row in zip(stamps_ns, readings, strict=True)]
+
+
+@pytest.mark.parametrize('begin_ns', [0, 10**18])
+@pytest.mark.parametrize('later_ms', [100, 400])
+@pytest.mark.parametrize('first', ['swapped', 'gap'])
+def test_a_gap_soon_after_another_stray_is_a_gap(imu, noise, first, later_ms, begin_ns):
+    """Two swapped samples, or a gap of 40 ms, and then a gap of 150 ms: also in simulated time, which begins at 0."""
+    before = [begin_ns + STEP_NS * k for k in range(100)]
+    if first == 'swapped':
+        before += [begin_ns + STEP_NS * k for k in (101, 100)]
+        lost = [Verdict.USE, Verdict.BACKWARD]
+    else:
+        before += [before[-1] + 40_000_000 + STEP_NS * k for k in range(2)]
+        lost = [Verdict.AHEAD] * 2
+    between = [max(before) + STEP_NS * (k + 1) for k in range(later_ms // 5)]
+    after = [between[-1] + 150_000_000 + STEP_NS * k for k in range(20)]
+    found = stamped(imu, noise, before + between + after)
+    assert found[:102] == [Verdict.USE] * 100 + lost
+    assert set(found[102 : 102 + len(between)]) == {Verdict.USE}
+    assert found[102 + len(between) :] == [Verdict.AHEAD] * 2 + [Verdict.USE] * 18
