@@ -32,7 +32,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.filter = PoseEkf(self.config)
         self._imu = ImuQueue(self, self._on_imu, self.filter.keep_imu)
         self._status = FilterStatus(self.filter, self._imu, self.console)
-        self._corrections = MapCorrections(self.config.max_delay)
+        self._corrections = MapCorrections()
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
         self._corrections.follow(self, self._on_map_moved)
         self._frames = RobotFrames(self, lambda: self.filter.reset('the pose of the camera on the robot has changed'))

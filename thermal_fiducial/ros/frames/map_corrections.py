@@ -10,7 +10,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import positive
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
-from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.counting import CountingNode
 from thermal_fiducial.ros.messages import convert, message_bytes
@@ -19,14 +19,28 @@ from thermal_fiducial.ros.messages import convert, message_bytes
 _REMEMBERED = 10
 
 
+class _Corrections:
+    """The last corrections of the map, each with the stamp of the newest frame before it."""
+
+    def __init__(self) -> None:
+        self._log: deque[tuple[int, FloatArray]] = deque(maxlen=_REMEMBERED)
+
+    def add(self, stamp_ns: int, T_new_old: FloatArray) -> None:
+        """Log that the map moved by ``T_new_old`` (4, 4) after the frame of ``stamp_ns``."""
+        self._log.append((stamp_ns, T_new_old))
+
+    def since(self, stamp_ns: int) -> list[FloatArray]:
+        """Corrections (4, 4) after a frame, the oldest first; larger differences of stamps are due to another clock."""
+        return [T_new_old for after_ns, T_new_old in self._log if 0 <= after_ns - stamp_ns <= LATEST_NS]
+
+
 class LatePoses:
     """For the publisher: transforms poses of frames processed after a correction into the map as of their stamps."""
 
     def __init__(self) -> None:
         #: stamp of the newest frame so far
         self.newest_ns = 0
-        self._moved_ns = 0
-        self._T_new_old: FloatArray = np.eye(4)
+        self._corrections = _Corrections()
 
     def add(self, stamp_ns: int) -> None:
         """Log the stamp of a frame; a much older stamp means a backward clock jump."""
@@ -34,24 +48,20 @@ class LatePoses:
 
     def moved(self, T_new_old: FloatArray) -> None:
         """Log that the map moved by ``T_new_old`` (4, 4) after the newest frame."""
-        self._moved_ns, self._T_new_old = self.newest_ns, T_new_old
+        self._corrections.add(self.newest_ns, T_new_old)
 
     def as_of_its_stamp(self, pose: CameraPose) -> CameraPose:
         """``pose``, given in the present map, in the map as of its stamp."""
-        if 0 <= self._moved_ns - pose.stamp_ns <= LATEST_NS:
-            return in_moved_map(pose, inverse(self._T_new_old))
+        for T_new_old in reversed(self._corrections.since(pose.stamp_ns)):
+            pose = in_moved_map(pose, inverse(T_new_old))
         return pose
 
 
 class MapCorrections:
-    """For the subscriber: transforms poses into the present map and adds the covariance of the map's error.
+    """For the subscriber: transforms poses into the present map and adds the covariance of the map's error."""
 
-    ``window`` [s]: larger differences of stamps are due to another clock.
-    """
-
-    def __init__(self, window: float) -> None:
-        self._window_ns = window * SECOND_NS
-        self._corrections: deque[tuple[int, FloatArray]] = deque(maxlen=_REMEMBERED)
+    def __init__(self) -> None:
+        self._corrections = _Corrections()
         self._errors: deque[CameraPose] = deque(maxlen=_REMEMBERED)
         #: the last map error received with a pose
         self._error: CameraPose | None = None
@@ -72,7 +82,7 @@ class MapCorrections:
 
     def add(self, stamp_ns: int, T_new_old: FloatArray) -> None:
         """Log that the map moved by ``T_new_old`` (4, 4) after the frame of ``stamp_ns``."""
-        self._corrections.append((stamp_ns, T_new_old))
+        self._corrections.add(stamp_ns, T_new_old)
 
     def note_error(self, error: CameraPose) -> None:
         """Log the map's error at a pose (the covariance of ``error``)."""
@@ -82,13 +92,12 @@ class MapCorrections:
         """``pose``, given in the map as of its stamp, in the present map, with the covariance of the map's error."""
         self._error = next((error for error in self._errors if error.stamp_ns == pose.stamp_ns), self._error)
         error = self._error
-        if error is not None and abs(pose.stamp_ns - error.stamp_ns) <= self._window_ns:
+        if error is not None and abs(pose.stamp_ns - error.stamp_ns) <= LATEST_NS:
             # The map's error changes slowly, so the last one is used, limited to what the pose's covariance contains.
             of_map, relative = error.covariance, pose.covariance - error.covariance
             if np.linalg.eigvalsh(relative)[0] < 0.0:
                 of_map = pose.covariance - positive(relative)
             pose = replace(pose, map_covariance=of_map)
-        for stamp_ns, T_new_old in self._corrections:
-            if 0 <= stamp_ns - pose.stamp_ns <= self._window_ns:
-                pose = in_moved_map(pose, T_new_old)
+        for T_new_old in self._corrections.since(pose.stamp_ns):
+            pose = in_moved_map(pose, T_new_old)
         return pose
