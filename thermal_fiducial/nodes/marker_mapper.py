@@ -52,8 +52,13 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             self.console.event(f'marker {marker_id}', line)
         if self._result.learned:
             self._map.note_learned()
-        if self._map.refinement.step(stamp) or self._result.map_changed:
-            self._publish_map()
+        refined = False
+        try:
+            refined = self._map.refinement.step(stamp)
+        finally:
+            # A refinement that failed is no reason to keep back what this frame changed.
+            if refined or self._result.map_changed:
+                self._publish_map()
 
     def _publish_jump(self, T_new_old: FloatArray | None) -> None:
         """Publish a replaced map, and the correction of poses with the stamp of the newest frame before it."""

@@ -21,6 +21,7 @@ from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.filter.state import POSITION
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import save_camera
@@ -33,6 +34,7 @@ from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import ERROR, OK, WARN
+from thermal_fiducial.ros.mapper_node.map_refinement import MapRefinement
 from thermal_fiducial.ros.messages import clouds, convert, message_bytes
 
 pytestmark = pytest.mark.ros
@@ -365,6 +367,21 @@ def test_a_mapper_that_cannot_keep_up_takes_the_newest_frame_and_counts_the_othe
     _, reason, figures = graph.diagnose(node)
     assert (len(graph.heard['camera_pose']), figures['left /markers']) == (1, '5')
     assert reason == '5 older frames skipped'
+
+
+def test_a_refinement_that_fails_keeps_no_change_of_the_map_back(graph, map_file, monkeypatch):
+    def failed(*_):
+        raise InputError('its process ended')
+
+    learn = MarkerMapper.learn
+    monkeypatch.setattr(MapRefinement, 'step', failed)
+    monkeypatch.setattr(MarkerMapper, 'learn', lambda self, frame: replace(learn(self, frame), map_changed=True))
+    graph.add(MarkerMapperNode, map_file=str(map_file))
+    graph.listen(PointCloud2, 'marker_map', qos.LATCHED)
+    graph.spin_until(lambda: graph.heard['marker_map'])
+    graph.send('thermal/camera_info', info())
+    graph.send('markers', markers())
+    graph.spin_until(lambda: len(graph.heard['marker_map']) == 2)
 
 
 def test_services_save_freeze_and_reset(graph, map_file):
