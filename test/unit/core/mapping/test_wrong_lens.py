@@ -22,11 +22,13 @@ def test_corridors_claim_how_much_their_lenses_bend_them():
     check(8, 600)
 
 
-@pytest.mark.parametrize(('seeds', 'frames'), [(2, 400), pytest.param(8, 600, marks=pytest.mark.nightly)])
-def test_poses_on_the_map_of_an_earlier_flight_claim_no_more_than_twice_their_error(seeds, frames):
+@pytest.mark.parametrize(
+    ('seeds', 'frames', 'largest'), [(2, 400, 1.4), pytest.param(8, 600, 2.5, marks=pytest.mark.nightly)]
+)
+def test_poses_on_the_map_of_an_earlier_flight_claim_what_they_are_off_by(seeds, frames, largest):
     """A file has the covariance of each marker; how their errors are correlated is assumed."""
     squared, claimed, nees = np.mean([corridor_again(seed, 0.1, frames) for seed in range(seeds)], axis=0)
-    # Two flights: 18 mm at a claim of 19, NEES 0.8; eight: 15 mm, 28 and 0.6. With a bound for any correlations claims
-    # were three times the errors. A flight has about two independent errors: four of them scatter by a half.
-    assert 0.5 < np.sqrt(claimed / squared) < 2.0
-    assert 0.3 < nees < 1.5
+    # As above.
+    assert 0.3 < nees < 1.7
+    # Claims over errors of 1.07 and 1.92, and of 1.73 and 3.13 where errors count as correlated in any way: half-way.
+    assert claimed < largest**2 * squared
