@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
-from thermal_fiducial.core.geometry.se3 import skew, so3_exp, so3_left_jacobian, transform
+from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian, transform
 from thermal_fiducial.core.types import FloatArray
 
 #: Error coordinates by index. Core, expressed in the robot frame [rad, m/s, m],
@@ -80,10 +80,10 @@ class NavigationState:
 
     def derivative(self, imu: FloatArray) -> FloatArray:
         """Time derivative (9,) of the core for a sample ``imu`` (6,): X(t + s) = X(t) Exp(derivative s)."""
-        derivative, velocity = np.empty(9), self.velocity_body
+        derivative = np.empty(9)
         derivative[:6] = self.corrected(imu)
-        derivative[VELOCITY] += self.gravity @ self.R_map_body - skew(derivative[ROTATION]) @ velocity
-        derivative[POSITION] = velocity
+        derivative[VELOCITY] += self.gravity @ self.R_map_body
+        derivative[POSITION] = self.velocity_body
         return derivative
 
     def moved(self, error: FloatArray) -> 'NavigationState':

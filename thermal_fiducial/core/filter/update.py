@@ -19,6 +19,8 @@ from thermal_fiducial.core.filter.state import (
     of_clock,
     of_core,
     POSE,
+    POSITION,
+    ROTATION,
     SIZE,
     SYSTEMATIC,
     TIME_OFFSET,
@@ -178,7 +180,9 @@ def _second_order_of_clock(prior: Estimate, motion: MotionAtPose, derivative: Fl
 
     The square enters by half of the acceleration.
     """
-    P, acceleration = prior.covariance, derivative[VELOCITY]
+    P = prior.covariance
+    # Of the position in the coordinates of a measured pose, in the robot's turning frame.
+    acceleration = derivative[VELOCITY] - skew(derivative[ROTATION]) @ derivative[POSITION]
     with_velocity, variance = P[VELOCITY, TIME_OFFSET], float(P[TIME_OFFSET, TIME_OFFSET])
     square = 0.75 * variance**2
     R = np.zeros((6, 6))

@@ -54,6 +54,16 @@ def test_the_state_moves_by_the_error(estimate):
     np.testing.assert_allclose(difference(estimate.state, moved), error, atol=1e-9)
 
 
+def test_the_derivative_of_the_state_is_that_of_its_propagation(estimate):
+    """X(t + s) = X(t) Exp(derivative s), for a robot that turns while it flies."""
+    seconds = 1e-5
+    steps = Steps(IMU[None], np.array([seconds]), DENSITIES[None])
+    later = propagated(estimate, steps, estimate.stamp_ns + 10_000, NO_WALKS).state
+    found = difference(estimate.state, later)[CORE] / seconds
+    # 1e-5 s of its own change, of up to 20 a second.
+    np.testing.assert_allclose(estimate.state.derivative(IMU), found, atol=2e-4)
+
+
 def test_a_step_is_the_integral_of_the_motion(estimate):
     n = 20000
     dt = SECONDS / n
