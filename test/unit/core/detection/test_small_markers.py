@@ -15,7 +15,7 @@ from support.small_pictures import (
 
 from thermal_fiducial.cli.marker_measurement import camera_and_detector, show
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corners.blurred_patterns import PatternView
+from thermal_fiducial.core.detection.corners.blurred_patterns import pattern_grid, PatternView
 from thermal_fiducial.core.detection.corners.pattern_fit import evidence_of, fit_patterns
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.detection.patterns import Decoder
@@ -228,3 +228,14 @@ def test_a_lens_that_bends_lines_displaces_no_small_marker():
     together = tally.corner_errors.mean(axis=1)
     # 0.006 when this was written, before 0.017.
     assert np.sqrt(np.mean(together**2)) < 0.01
+
+
+def test_a_large_marker_that_is_seen_obliquely_has_as_many_samples_as_it_needs():
+    """Its narrow side decides that its pattern is fitted, its long ones how densely: 40,000 samples."""
+    decoder = Decoder(load_dictionary('DICT_4X4_50').bits, 1)
+    quads = np.array([[[20.0, 20.0], [50.0, 30.0], [50.0, 220.0], [20.0, 230.0]]])
+    image = np.random.default_rng(1).normal(7000.0, 3.0, (HEIGHT, WIDTH)).astype(np.float32)
+    grid = pattern_grid(decoder.cells, 30)
+    samples = PatternView(image).gray(quads, grid)
+    assert samples.shape == (1, len(grid.along) ** 2)
+    assert samples.shape[1] > 32767

@@ -35,6 +35,8 @@ BOWL = 4
 BOWL_AMOUNT, BOWL_AT_CORNERS = LINEAR.start + BOWL, 0.5
 # Places among the linear terms of the gradients of the contrast, and of what gain control adds.
 _GRADIENTS, _OF_GAIN_CONTROL = slice(1, 3), slice(5, None)
+# Longest row of places that OpenCV interpolates at once.
+_LONGEST_ROW = 2**15 - 1
 # Cumulative standard normal distribution, by a table.
 _FARTHEST = 6.0
 _Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
@@ -110,8 +112,10 @@ class PatternView(NamedTuple):
         return np.asarray(shown - shown[:, :1])
 
     def _at(self, places: Float32Array) -> Float32Array:
-        shown = cv2.remap(self.image, places[0], places[1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(shown, dtype=np.float32)
+        samples = places.shape[2]
+        u, v = places.reshape(2, -1, samples if samples < _LONGEST_ROW else math.isqrt(samples))
+        shown = cv2.remap(self.image, u, v, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(shown, dtype=np.float32).reshape(places.shape[1:])
 
 
 def lens_bends(corners: ImagePoints, camera: Camera) -> FloatArray:
