@@ -46,19 +46,16 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         stamp, markers = clouds.stamped_markers(message)
         frame = self.mapper.locate(stamp, markers, self.camera(), self.odometry)
         self._poses.send(stamp, frame.pose)
-        # After publishing the pose, which must not wait for the map.
         before, self._result = self._result, self.mapper.learn(frame)
         for marker_id, line in map_status.news(before, self._result).items():
             self.console.event(f'marker {marker_id}', line)
         if self._result.learned:
             self._map.note_learned()
-        refined = False
-        try:
-            refined = self._map.refinement.step(stamp)
-        finally:
-            # A refinement that failed is no reason to keep back what this frame changed.
-            if refined or self._result.map_changed:
-                self._publish_map()
+        # After the pose, which must not wait, and before a refinement, which raises an error if it has failed.
+        if self._result.map_changed:
+            self._publish_map()
+        if self._map.refinement.step(stamp):
+            self._publish_map()
 
     def _publish_jump(self, T_new_old: FloatArray | None) -> None:
         """Publish a replaced map, and the correction of poses with the stamp of the newest frame before it."""

@@ -64,6 +64,10 @@ class Candidate:
         """Apply a displacement of the map to the views' camera poses."""
         self.views = [view.moved(displacement.at(view.stamp_ns)) for view in self.views]
 
+    def calibrate(self, before: Camera, now: Camera) -> None:
+        """Keep the directions of all views where the calibration of the camera changes."""
+        self.views = [view.in_pixels_of(before, now) for view in self.views]
+
     def place(self, camera: Camera, errors: SystematicErrors) -> MapMarker | str:
         """The marker in the map if the views determine it uniquely, else what it waits for, in words."""
         self.untried = 0
@@ -119,7 +123,7 @@ class NewMarkers:
     def __init__(self, size: float, sizes: Mapping[int, float]) -> None:
         self._size, self._sizes = size, sizes
         self.candidates: dict[int, Candidate] = {}
-        #: that all views are of
+        #: in whose pixels all views are
         self._camera: Camera | None = None
 
     def show(
@@ -127,14 +131,14 @@ class NewMarkers:
     ) -> tuple[list[MapMarker], dict[int, str]]:
         """Add a frame's views to the candidates, except markers without a pose.
 
-        With another calibration they begin anew: the pixels of earlier views mean other directions in it.
-
         Returns
         -------
         Markers to enter the map, now determined by their views, and what the others wait for, in words by ID.
         """
-        if self._camera is None or not camera.matches(self._camera):
-            self._camera, self.candidates = camera, {}
+        if self._camera is not None and not camera.matches(self._camera):
+            for candidate in self.candidates.values():
+                candidate.calibrate(self._camera, camera)
+        self._camera = camera
         shown = []
         posed = np.isfinite(seen.branches[:, 0]).all(axis=(1, 2))
         for i, marker_id in zip(np.flatnonzero(posed).tolist(), seen.ids[posed].tolist(), strict=True):

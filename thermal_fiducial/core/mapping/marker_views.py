@@ -14,7 +14,7 @@ from thermal_fiducial.core.error_model import (
     SystematicErrors,
     with_corner_errors,
 )
-from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import linearise
 from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
 from thermal_fiducial.core.lens_errors import LensErrors
@@ -85,6 +85,14 @@ class MarkerView:
         # Both branches put the centre at the same place: the direction doesn't depend on the ambiguity.
         arm = self.viewpoint.T_map_camera[0, :3, :3] @ self.branches[0, :3, 3]
         return np.asarray(-arm / np.linalg.norm(arm))
+
+    def in_pixels_of(self, before: Camera, now: Camera) -> 'MarkerView':
+        """The same directions in pixels of the camera's calibration ``now``, where it was that of ``before``."""
+        at = ImagePoints.at(self.corners, before)
+        corners, J = now.distort_linearised(at.x)
+        gain = J @ at.inverse
+        covariances = gain @ self.corner_covariances @ np.swapaxes(gain, -1, -2)
+        return replace(self, corners=corners, corner_covariances=covariances)
 
     def moved(self, T_new_old: FloatArray) -> 'MarkerView':
         """The same view in a displaced map."""
