@@ -54,7 +54,7 @@ class PoseEkf:
         self._first_offset = camera_time_offset
         self._noise = ImuNoiseMonitor(config.imu)
         self._history = History(config, camera_time_offset)
-        #: corrections of the map since then, which the filter does not notice: it estimates in the map as it was
+        #: T_new_first of the map's corrections since the filter began; it keeps its first map, and outputs are moved
         self._T_map_first: FloatArray | None = None
         #: on the last IMU sample
         self._verdict = Verdict.USE

@@ -28,8 +28,8 @@ from thermal_fiducial.core.types import SECOND_NS
 
 #: The propagated estimate is stored at this interval [ns], so that a pose begins there and not at the pose before.
 _KEPT_EVERY_NS = 10_000_000
-#: Standard deviation of a suspected step of the IMU's clock as a share of its size: it is all of it or nothing, samples
-#: being lost, with equal odds.
+#: Standard deviation of a suspected step of the IMU's clock as a share of its size: the clock has stepped by all of it,
+#: or samples are lost and it has not stepped, with equal odds.
 _STEP_OR_LOSS = 0.5
 _stamp = attrgetter('stamp_ns')
 

@@ -14,8 +14,8 @@ _SLOW = 0.2
 _SHORTEST_LAG, _MEMORY = 0.02, 2.0
 _OCTAVES = np.arange(7)
 _LAGS = _SHORTEST_LAG * 2.0**_OCTAVES
-#: Largest exponents of the structure function: of the measured one, as motion need not stay linear in a gap, and of
-#: _LEAST_MOTION.
+#: Largest exponents of the structure function: of the measured one, as motion may become nonlinear in a gap, and of the
+#: least motion that is assumed.
 _SMOOTHEST = np.repeat((1.5, 2.0), 2)
 #: Added before logarithms are taken [(rad/s)^2, (m/s^2)^2].
 _TINY = 1e-12

@@ -20,7 +20,7 @@ from thermal_fiducial.core.types import FloatArray
 #: Least white variance of a pose as a multiple of its own covariance: the systematic error has all of it besides; with
 #: half of it the fused pose before a recorded board claims less than its error.
 WHITE = 0.5
-#: The same before anything is learned: the white error may be all that a pose claims.
+#: Variance of the white error before anything is learned: it may be all that a pose claims.
 _WHITE_AT_FIRST = 1.0
 #: Least and largest values of the three variances of :class:`PoseNoise`, and the memory [poses] with which they are
 #: learned: poses that claim too little must not be refused for long.
@@ -81,7 +81,8 @@ class BodyPose:
     def map_error_left(self, last: 'BodyPose') -> FloatArray:
         """Covariance (6, 6), conventions of ``covariance``, by which the map's error of the ``last`` pose was larger.
 
-        An estimate by the last pose is off by that in the map of this one, as far as the error is another one.
+        An estimate made from the last pose is off by that relative to the markers of this one, as far as their errors
+        are not common to both.
         """
         then, now = self._in_robot_frame(last.map_covariance), self.of_map
         to_units = np.linalg.inv(np.linalg.cholesky(now + self.shape))
@@ -104,9 +105,9 @@ def log_overlap(A: FloatArray, B: FloatArray) -> float:
 def share_that_stays(earlier: FloatArray, claimed: FloatArray) -> FloatArray:
     """Gain (6, 6) from an earlier systematic error to that of a pose, which is at most what the pose claims.
 
-    Where the pose claims less than the earlier error is large, it is from more: other markers, a motion that is known
-    by now. An estimate from more has its own covariance B in common with one from a part of it, whose covariance is A
-    (the better one cannot be improved by the other). So B / A of the earlier error stays, along each axis.
+    A pose that claims less than the systematic error so far uses more information: other markers, a motion that is
+    known by now. The better of two such estimates cannot be improved by the other, so their covariance is that of the
+    better one, B. The earlier error, of covariance A, is carried over with the gain B / A, at most 1 along each axis.
 
     Parameters
     ----------

@@ -31,8 +31,9 @@ from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian,
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
-#: The noise of the measured motion at a pose feigns information about the clock offset, 1 to 2 times its squared size
-#: in units of the innovation, growing with the gain. Taking it away at most doubles the offset's variance in one step.
+#: The derivative of a pose by the clock offset is a measured motion. Its noise n adds spurious information about the
+#: offset, 1 to 2 times n' diag(S^-1) n, growing with the gain. It is taken away; the offset's variance at most doubles
+#: in one step.
 _FEIGNED, _LEAST_KEPT = 1.5, 0.5
 _SIX = np.arange(6)
 #: Copied for every update, as an update leaves its results in the object.
@@ -200,7 +201,7 @@ def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, inno
     velocity would feign information about the offset s. (G. Huang, A. Mourikis, S. Roumeliotis, "Observability-based
     Rules for Designing Consistent EKF SLAM Estimators", IJRR 2010, keep other unobservable directions in the same way.)
 
-    Noise of the derivative feigns information too (errors in variables): the offset's variance is widened by its worth.
+    Noise of the derivative adds spurious information, too (errors in variables), which is taken away again.
     """
     with_offset, motion = P[TIME_OFFSET], innovation.motion
     variance = float(with_offset[TIME_OFFSET])

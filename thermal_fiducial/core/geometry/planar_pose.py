@@ -39,7 +39,7 @@ class PlanarPoses:
     chi2: FloatArray
 
     def ambiguous(self) -> BoolArray:
-        """Of which markers (N,) the image allows the other branch.
+        """Markers (N,) of which the image allows the other branch.
 
         Its squared error is below ``_AMBIGUOUS`` times that of the first branch, or times 2 if that is larger, the
         expectation for consistent covariances.

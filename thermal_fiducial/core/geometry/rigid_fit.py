@@ -69,7 +69,8 @@ def minimise(
     evaluated : function of poses: cost, half its gradient and half its Gauss-Newton Hessian, for steps of the origin
         and rotations about it, both in the parent frame
     alternatives : number of consecutive starts of the same body, of which only the best is needed
-    linear : angle [rad] far below which a step is exact; of a larger one that part is, by which it may be longer
+    linear : rotation [rad] after which as much of the cost is still to be gained as the step has gained. After a step
+        by an angle a it is taken for ``gain * min((a / linear)**2, 1)``; the search ends where that is negligible
 
     Returns
     -------

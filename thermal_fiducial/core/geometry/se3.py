@@ -257,9 +257,10 @@ def grown(quads: FloatArray, factor: float | FloatArray) -> FloatArray:
 
 
 def perspective(c: FloatArray) -> FloatArray:
-    """Third homogeneous coordinates (Q, 4) that make views (Q, 4, 2) of the corners of squares: alike from in front.
+    """Depths (Q, 4) of the corners of squares by their views (Q, 4, 2), up to a factor; equal from in front.
 
-    The diagonals of a square halve each other. What they do in its view, the triangles of all corners but one show.
+    The diagonals of a square halve each other, so the depth of a corner is proportional to the area of the triangle of
+    the other three.
     """
     to_next = c.take(_NEXT, axis=1) - c
     a, b = to_next.take(_NEXT, axis=1), to_next.take(_OPPOSITE, axis=1)

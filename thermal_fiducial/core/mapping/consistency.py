@@ -1,10 +1,10 @@
 """Which known markers are where the map has them.
 
 One that was moved, exists twice or has a wrong pose in the map contradicts the others in view, or odometry. Of three
-such a marker is an outlier of a robust fit. Of two either may have moved: the robust fit follows one of them, now this
-and now that. What is unknown is discrete, which of them it is, and the camera as predicted by odometry is the
-measurement that decides it. A marker alone in view has nothing but odometry to contradict. One such frame is an
-outlier; most frames of a second are evidence, and put the marker in quarantine.
+such a marker is an outlier of a robust fit. Of two either may have moved, and the robust fit follows one of them in
+some frames and the other one in others. Which of them it is decides the camera as predicted by odometry (a test of two
+hypotheses). A marker alone in view has nothing but odometry to contradict. One such frame is an outlier; most frames of
+a second are evidence, and put the marker in quarantine.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -99,9 +99,9 @@ def contradicting(sight: Sight) -> Refusal:
 class Consistency:
     """What the frames say of the known markers: a quarantine, and the marker that alone in view is misplaced.
 
-    From the own views of a marker alone in view nothing can be learned about which is right, it or odometry: they all
-    agree with each other, and after some seconds without another marker odometry has drifted so far that it contradicts
-    nothing. So what the first view showed is remembered, until the marker is back in its place, is seen with another
+    Views of a marker that is alone in view cannot decide between it and odometry: they agree with each other, and after
+    some seconds without another marker odometry has drifted so far that it contradicts nothing. So what the first view
+    showed is remembered, until the marker is back in its place, is seen with another
     one, or a second marker contradicts odometry too: then it is odometry that is wrong.
 
     Parameters

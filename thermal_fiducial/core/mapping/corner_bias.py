@@ -14,7 +14,8 @@ from thermal_fiducial.core.types import FloatArray, TINY
 BIAS_PRIOR, BIAS_MEMORY = 5.0, 1.0 - 1.0 / 300.0
 #: Residuals of a marker beyond this many standard deviations of the bias count as so many.
 BIAS_OUTLIER = 2.0
-#: The same of the shape, as a variance in units of the noise: 99.9 % of markers with noise alone.
+#: Variance of a marker's shape, in units of the noise, beyond which it counts as so much: 99.9 % of markers with noise
+#: alone are below.
 LARGEST_SHAPE = CHI2_OF_VIEW / 8.0
 #: Part of the variance of independent corners that is left without their mean.
 SHAPE_VISIBLE = 0.75
@@ -107,8 +108,8 @@ class ShownErrors(NamedTuple):
     def smooth_variance(self, known: float) -> float:
         """Variance b^2 [px^2], without errors of corners of their own as far as they are ``known`` in ``product``.
 
-        More of these than the detector knows of is taken for a sign of smooth errors: a lens model that is wrong within
-        a marker is worse over the whole image, where the pose hides it.
+        Errors of single corners beyond what the detector declares are attributed to the smooth error of the lens: a
+        model that is wrong within a marker is worse over the whole image, where the pose hides it.
         """
         own = (self.product * self.both - self.smooth_product * self.smooth) / (self.own * self.both - self.smooth**2)
         return (self.product - min(max(own, 0.0) * self.own, known)) / self.smooth

@@ -139,7 +139,7 @@ class MisplacedMarker:
     id: int
     #: stamp of the first such frame
     since_ns: int
-    #: (4, 4) from the camera pose by odometry to the one by the marker, there: T_by_marker = T_moved @ T_by_odometry
+    #: (4, 4) with T_map_camera by the marker = T_moved @ T_map_camera by odometry, in the first such frame
     T_moved: FloatArray
     #: between the marker and its place in the map [m]
     distance: float

@@ -40,7 +40,7 @@ class Viewpoint:
     covariances: FloatArray
     #: (2, 6, K) joint draws of either's error that other views share: it moves the marker, but leaves no residual
     draws: FloatArray
-    #: (6, 2) the same by one standard deviation of the scales, of map and lens
+    #: (6, 2) displacements of the camera by one standard deviation of the scales, of map and lens
     scales: FloatArray
 
     @property
@@ -116,7 +116,7 @@ class FittedPoses:
 
 @dataclass(frozen=True)
 class _Weights:
-    """Of n views of S markers, as decided from where the markers and their cameras were taken to be."""
+    """Weights of n views of S markers, as decided from where the markers and their cameras were taken to be."""
 
     #: (S, n, 8, 8) by which residuals become unit white, and the logarithms (S, n) of their covariances' determinants
     W: FloatArray
@@ -200,7 +200,7 @@ class MarkerViews:
         return self._corners - uv.reshape(shape), J_camera.reshape(*shape, 6), J_marker.reshape(*shape, 6)
 
     def _weights(self, T: FloatArray, chosen: IntArray) -> _Weights:
-        """Of the views of markers at T (S, 4, 4) from the chosen (S, n) of each camera's poses.
+        """Weights of the views of markers at T (S, 4, 4) from the chosen (S, n) of each camera's poses.
 
         A residual comes of the corners' noise, of the systematic part, and of the camera's own pose, which moves all
         four corners together. What cannot be, a corner in the plane of the camera, has an infinite determinant.

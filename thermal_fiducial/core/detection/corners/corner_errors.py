@@ -17,8 +17,8 @@ OF_LOCAL_PX = 0.18
 #: A corner by the whole pattern of a small marker [px]: the blur of the optics is not quite a Gaussian. Rendered frames
 #: without noise.
 OF_PATTERN_PX = 0.006
-#: The same in a picture for a display [px]: gray levels there are a nonlinear function of the counts, and sheets are
-#: bent. Photos of a room and of a carpet, against the same at full resolution.
+#: A corner by the whole pattern in a picture for a display [px]: gray levels there are a nonlinear function of the
+#: counts, and sheets are bent. Photos of a room and of a carpet, against the same at full resolution.
 OF_DISPLAYED_PATTERN_PX = 0.05
 #: A side in a picture for a display, a nonlinear function of the counts [px]: if its middle gray lies anywhere between
 #: a fifth and four fifths of the original step, a step blurred by 0.66 px is displaced by up to 0.55, evenly spread.
@@ -50,7 +50,8 @@ OF_LAG, OF_LAG_FORM = 0.35, 0.014
 #: Displacement of a corner by motion blur that is not modelled [px], over the residuals that it leaves [contrasts], and
 #: the residuals beyond which they hardly grow with it. Measured: 0.015 at rest, 0.05 at 1.5 px of blur, 0.08 at 6 px.
 BLUR_THAT_SHOWS, BLURRED_OUT = 20.0, 0.055
-#: The same of any marker that can be read, in cells: nine of ten are off by less than 0.65, seen without a motion.
+#: Displacement by motion blur of any marker that can be read, in cells: nine of ten are off by less than 0.65 where no
+#: motion is modelled.
 READABLE_CELLS = 0.4
 
 _EYE = np.eye(2)

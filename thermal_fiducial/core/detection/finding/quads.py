@@ -24,7 +24,7 @@ _FLOOR_OF_CLEAR = 4.0
 # Tolerance of polygon approximation as a share of an outline's length: above the effect of noise, below a side.
 _STRAIGHT = 0.05
 _CORNERS = 4
-# Of OpenCV.
+# Image as OpenCV's functions are typed.
 _Image: TypeAlias = np.ndarray[Any, Any]
 
 
@@ -94,7 +94,7 @@ class DarkRegions:
 
 
 def dark_in_picture(picture: Float32Array, noise: float) -> Gray:
-    """The same of a picture for a display, whose pixels have little noise: markers of cells of a pixel show in it."""
+    """Dark pixels of a picture for a display, which has little noise: markers of cells of a pixel show in it."""
     mean = np.asarray(cv2.blur(picture, (_PICTURE_WINDOW_PX, _PICTURE_WINDOW_PX)), dtype=np.float32)
     limit = mean - np.float32(max(_PICTURE_STEP, _PICTURE_NOISE * noise))
     return np.asarray(cv2.compare(picture, limit, cv2.CMP_LT), dtype=np.uint8)

@@ -30,7 +30,7 @@ _STALE_NS = 150_000_000
 _JITTER_S = 0.001
 # Standard deviation of the delay of corners in a lagging image before the twist is known [lag].
 _DELAY_UNSURE = 0.5
-# Of the corners of a marker.
+# Number of coordinates of the corners of a marker.
 _COORDINATES = 8
 # Odometry that gives the twist of a frame: from 3 time constants of the lag before the frame to one after it, a window
 # about the velocity of one time constant before, which causes the blur. Largest number of states; time constant that is
