@@ -22,6 +22,8 @@ _LONGEST_SHOWN = 100
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
 #: Prefix of ROS's parameters for the quality of service, which a file for several packages may have.
 QOS_OVERRIDES = 'qos_overrides.'
+#: 99.9 % quantile of chi square with six degrees of freedom, of a pose: beyond it two poses contradict each other.
+CHI2_OF_POSE = 22.5
 
 
 def param(
@@ -726,8 +728,9 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         0.3, 'Change of the view that decorrelates the systematic error.', unit='rad', minimum=0.001, maximum=10.0
     )
     gate: float = param(
-        22.5,
-        'Gate: a pose with a larger NIS is refused (22.5: 99.9 % quantile of chi-square, 6 degrees of freedom).',
+        CHI2_OF_POSE,
+        f'Gate: a pose with a larger NIS is refused ({CHI2_OF_POSE}: 99.9 % quantile of chi-square, '
+        '6 degrees of freedom).',
         minimum=1.0,
         dynamic=True,
     )

@@ -48,8 +48,8 @@ class SystematicErrors:
     marker_shape: float = 0.7
 
 
-#: 99.9 % limits of chi square with six and eight degrees of freedom, of a pose and of a view of a marker.
-CHI2_OF_POSE, CHI2_OF_VIEW = 22.5, 26.1
+#: 99.9 % quantile of chi square with eight degrees of freedom, of a view of a marker.
+CHI2_OF_VIEW = 26.1
 #: For data without systematic errors: simulated corners.
 NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0)
 #: Errors of successive odometry poses are correlated for seconds: this many count as one.

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import CHI2_OF_POSE, CHI2_OF_VIEW, NO_SYSTEMATIC_ERRORS, SystematicErrors
+from thermal_fiducial.config import CHI2_OF_POSE
+from thermal_fiducial.core.error_model import CHI2_OF_VIEW, NO_SYSTEMATIC_ERRORS, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
 from thermal_fiducial.core.geometry.rigid_fit import robust

@@ -10,7 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import CHI2_OF_POSE, of_correlated_odometry, of_single_error
+from thermal_fiducial.config import CHI2_OF_POSE
+from thermal_fiducial.core.error_model import of_correlated_odometry, of_single_error
 from thermal_fiducial.core.frame_period import FramePeriod
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract, turned
 from thermal_fiducial.core.geometry.se3 import inverse
