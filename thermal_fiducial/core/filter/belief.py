@@ -148,6 +148,7 @@ class Belief(NamedTuple):
         """Why the alternative ``other`` replaces ``main``, in words; empty if it does not."""
         if other.accepted_ns - main.accepted_ns > config.reinitialise_after * SECOND_NS:
             return f'no pose was accepted for {config.reinitialise_after:.0f} s'
+        # Relative to the map: in one that is known poorly the pose may not be flown on, but the estimate is good.
         if main.estimate.std(POSITION) > config.lost_position_std:
             return 'the pose was lost, and markers are seen again'
         lasting = other.accepted_ns - other.started_ns >= config.reset_after * SECOND_NS
