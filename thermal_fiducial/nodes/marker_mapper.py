@@ -43,19 +43,19 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._poses.configure()
 
     def _on_markers(self, message: bytes) -> None:
-        stamp, markers = clouds.stamped_markers(message)
-        frame = self.mapper.locate(stamp, markers, self.camera(), self.odometry)
-        self._poses.send(stamp, frame.pose)
+        frame = self.mapper.locate(*clouds.stamped_markers(message), self.camera(), self.odometry)
+        self._poses.send(frame.stamp_ns, frame.pose)
         before, self._result = self._result, self.mapper.learn(frame)
         for marker_id, line in map_status.news(before, self._result).items():
             self.console.event(f'marker {marker_id}', line)
         if self._result.learned:
             self._map.note_learned()
-        # After the pose, which must not wait, and before a refinement, which raises an error if it has failed.
-        if self._result.map_changed:
-            self._publish_map()
-        if self._map.refinement.step(stamp):
-            self._publish_map()
+        changed = self._result.map_changed
+        try:
+            changed |= self._map.refinement.step(frame.stamp_ns)
+        finally:  # A refinement that has failed keeps no change of this frame back.
+            if changed:
+                self._publish_map()
 
     def _publish_jump(self, T_new_old: FloatArray | None) -> None:
         """Publish a replaced map, and the correction of poses with the stamp of the newest frame before it."""
