@@ -6,9 +6,9 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
+from support.interrupts import interrupted
 from support.small_bag import map_of
 
 from thermal_fiducial.cli.main import COMMANDS, main
@@ -190,27 +190,12 @@ def test_a_demo_that_cannot_be_flown_leaves_the_earlier_one(tmp_path, capsys):
 @pytest.mark.parametrize(('after_s', 'again'), [(0.3, False), (0.3, True), (6.0, True)])
 def test_an_interrupt_of_simulate_is_one_line_and_leaves_nothing(tmp_path, after_s, again):
     """While its workers still import what they need, and while they render; a second one comes while Python ends."""
-    # A shell's background jobs ignore the signal, and so would what they start.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    process = subprocess.Popen(
-        [sys.executable, '-m', 'thermal_fiducial', 'simulate', str(tmp_path / 'bag'), '--seconds', '20'],
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    while process.poll() is None and not children(process.pid):
-        time.sleep(0.05)
-    time.sleep(after_s)
-    os.killpg(process.pid, signal.SIGINT)
-    if again:
-        time.sleep(0.2)
-        os.killpg(process.pid, signal.SIGINT)
-    # Workers that stay would hold the pipe.
-    error = process.communicate(timeout=60)[1]
+    words = ['simulate', tmp_path / 'bag', '--seconds', '20']
+    status, error = interrupted(words, children, after_s, times=2 if again else 1, apart_s=0.2)
     # For a shell both are 130.
-    assert process.returncode == 130 or (again and process.returncode == -signal.SIGINT)
-    assert error.splitlines()[-1] == 'thermal-fiducial simulate: interrupted'
-    assert 'Traceback' not in error
+    assert status == 130 or (again and status == -signal.SIGINT)
+    assert error[-1] == 'thermal-fiducial simulate: interrupted'
+    assert not any('Traceback' in line for line in error)
     assert not (tmp_path / 'bag').exists()
 
 
