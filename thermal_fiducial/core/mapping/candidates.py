@@ -103,7 +103,8 @@ class Candidate:
 
     def _drop_most_redundant(self) -> None:
         """Drop the view whose nearest neighbour is the nearest of all."""
-        cosines = self._directions @ self._directions.T - 2.0 * np.eye(len(self.views))
+        directions = self._directions
+        cosines = directions @ directions.T - 2.0 * np.eye(len(self.views))
         del self.views[int(np.argmax(np.max(cosines, axis=1)))]
 
     @property

@@ -2,9 +2,9 @@
 
 One that was moved, exists twice or has a wrong pose in the map contradicts the others in view, or odometry. Of three
 such a marker is an outlier of a robust fit. Of two either may have moved, and the robust fit follows one of them in
-some frames and the other one in others. Which of them it is decides the camera as predicted by odometry (a test of two
-hypotheses). A marker alone in view has nothing but odometry to contradict. One such frame is an outlier; most frames of
-a second are evidence, and put the marker in quarantine.
+some frames and the other one in others. The camera as predicted by odometry decides which of them has moved (a test of
+two hypotheses). A marker alone in view has nothing but odometry to contradict. One such frame is an outlier; most
+frames of a second are evidence, and put the marker in quarantine.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -101,8 +101,8 @@ class Consistency:
 
     Views of a marker that is alone in view cannot decide between it and odometry: they agree with each other, and after
     some seconds without another marker odometry has drifted so far that it contradicts nothing. So what the first view
-    showed is remembered, until the marker is back in its place, is seen with another
-    one, or a second marker contradicts odometry too: then it is odometry that is wrong.
+    showed is remembered, until the marker is back in its place, is seen with another one, or a second marker
+    contradicts odometry too: then it is odometry that is wrong.
 
     Parameters
     ----------

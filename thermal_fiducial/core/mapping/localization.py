@@ -83,7 +83,7 @@ def _either(frame: '_JointFit', found: Location, T_other: FloatArray, prior: Flo
         return replace(found, pose=pose, noise=found.noise + spread)
     other = frame.refined(T_other, frame.sight.reprojected(frame.camera, T_other), found.weights)
     # One that hardly fits at all ends anywhere.
-    if other is None or np.sqrt(np.trace(other.pose.covariance[3:, 3:])) > _NOTHING_KNOWN:
+    if other is None or other.rotation_std > _NOTHING_KNOWN:
         return found
     if prior is None:
         both = Viewpoint.either(found.viewpoint, other.viewpoint)

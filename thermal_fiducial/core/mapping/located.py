@@ -115,14 +115,18 @@ class Location:
     #: (4 N, 6, 2) derivative of the pose by each corner [1/px]
     corner_gains: FloatArray
 
+    @property
+    def rotation_std(self) -> float:
+        """Standard deviation of the attitude [rad]."""
+        return math.sqrt(self.pose.covariance[3:, 3:].trace())
+
     @cached_property
     def reason(self) -> str:
         """Why the pose is not published, in words; empty if it is."""
-        std = math.sqrt(self.pose.covariance[3:, 3:].trace())
-        if std <= VAGUE:
+        if self.rotation_std <= VAGUE:
             return ''
         listed = ', '.join(str(key) for key in self.pose.marker_ids)
-        return f'known to {math.degrees(std):.0f} degrees only, by marker {listed}'
+        return f'known to {math.degrees(self.rotation_std):.0f} degrees only, by marker {listed}'
 
     @property
     def viewpoint(self) -> Viewpoint:
