@@ -188,9 +188,10 @@ class PoseEkf:
     def state(self) -> NavigationState | None:
         """Estimate at the newest IMU sample."""
         main = self._history.main
-        if main is None or self._T_map_first is None:
-            return main and main.estimate.state
-        return main.estimate.state.in_moved_map(self._T_map_first)
+        if main is None:
+            return None
+        state = main.estimate.state
+        return state if self._T_map_first is None else state.in_moved_map(self._T_map_first)
 
     @property
     def estimate(self) -> Estimate | None:

@@ -40,9 +40,9 @@ _LONGEST_ROW = 2**15 - 1
 # Cumulative standard normal distribution, by a table.
 _FARTHEST = 6.0
 _Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
+_BELOW = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z.tolist()])
 # Weights of the corners in the middles of the top, left, bottom and right side.
 _MIDDLES = bilinear(np.array([0.5, 0.0, 0.5, 1.0]), np.array([0.0, 0.5, 1.0, 0.5]))
-_BELOW = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z.tolist()])
 
 
 class PatternGrid(NamedTuple):
@@ -124,8 +124,8 @@ def lens_bends(corners: ImagePoints, camera: Camera) -> FloatArray:
     Those along the first axis are four times the mean displacement of the middles of the top and the bottom side.
     """
     middles = np.moveaxis(seen_between(corners.x, _MIDDLES), 0, -1)
-    seen = camera.distort(np.concatenate([corners.x, middles], axis=1))
-    off = np.moveaxis(seen[:, 4:], -1, 0) - seen_between(seen[:, :4], _MIDDLES)
+    uv = camera.distort(np.concatenate([corners.x, middles], axis=1))
+    off = np.moveaxis(uv[:, 4:], -1, 0) - seen_between(uv[:, :4], _MIDDLES)
     return np.asarray(2.0 * (off[..., :2] + off[..., 2:]))
 
 

@@ -93,7 +93,6 @@ def ending_sides(
     looked_at = (noise > (_MISFIT * contrast) ** 2) & (motion_px < _STILL_PX)
     if not looked_at.any():
         return np.zeros((len(contrast), 4), dtype=bool)
-    value, _, counting = modelled
     # For each part, not for each side: numpy is slow where it repeats the few numbers of a row.
     begins = _WHITE_BEGINS * width
     limits = np.array(
@@ -103,14 +102,14 @@ def ending_sides(
     step = 2 if counts.shape[1] >= _MANY else 1
     outside = -sides.distance[:, ::step]
     planes = np.empty((4, *outside.shape), dtype=np.float32)
-    np.multiply(counting[:, ::step], outside > limits[0], out=planes[0])
+    np.multiply(modelled.counting[:, ::step], outside > limits[0], out=planes[0])
     np.multiply(planes[0], outside > limits[1], out=planes[1])
     rest = counts[:, ::step] - counts[0, 0, 0, 0]
-    rest -= value[:, ::step] * limits[2]
+    rest -= modelled.value[:, ::step] * limits[2]
     np.multiply(planes[:2], rest, out=planes[2:])
     # Of all the white, and of its outer half. A product of matrices adds up three times as fast as a sum.
-    moments = np.ones(outside[:, :, 0, 0].size, dtype=np.float32) @ planes.reshape(4, -1, value[0, 0].size)
-    white, outer, white_sum, outer_sum = moments.reshape(4, *value.shape[2:]).sum(axis=2)
+    moments = np.ones(outside[:, :, 0, 0].size, dtype=np.float32) @ planes.reshape(4, -1, modelled.value[0, 0].size)
+    white, outer, white_sum, outer_sum = moments.reshape(4, *modelled.value.shape[2:]).sum(axis=2)
     contrast, noise = np.repeat(contrast, 4), np.repeat(noise, 4)
     number = np.array([outer, white - outer])
     level = np.array([outer_sum, white_sum - outer_sum]) / np.maximum(number, 1)
