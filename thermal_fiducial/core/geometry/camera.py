@@ -24,9 +24,14 @@ MODELS = {
     'rational_polynomial': ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6'),
     'equidistant': ('k1', 'k2', 'k3', 'k4'),
 }
-# Newton's iteration doubles the digits: after a step this small nothing is left, and ten are enough at any lens's
-# border.
-_STEPS, _SHORT = 10, 1e-6
+# Newton's iteration doubles the digits: after a step this small nothing is left, and twelve are enough half a degree
+# from the hemisphere of a fisheye lens.
+_STEPS, _SHORT = 12, 1e-6
+# Widest angle off the optical axis at which markers are looked for: normalised coordinates end at a right angle.
+_WIDEST = math.radians(85.0)
+# The same as a share of the normalised radius at which a lens folds back: from there on the image of a step outwards is
+# less than a fifth as long as in the middle.
+_BEFORE_FOLD = 0.9
 # A last coefficient below this has no root at any angle that a lens can have, but makes the others' overflow.
 _NO_COEFFICIENT = 1e-15
 # Coefficients of the derivative of angle + k1 angle^3 + k2 angle^5 ... with respect to the angle.
@@ -151,16 +156,15 @@ class Camera:
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
         """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
 
-        Newton's method converges at the border of a lens, where OpenCV's fixed-point iteration does not.
+        Newton's method converges at the border of a lens, where OpenCV's iterations do not: that of ``fisheye`` ends at
+        a distorted radius of a right angle, which lenses reach at smaller angles. Pixels that show what is no longer in
+        front of the camera have no such coordinates; what they give is huge or not finite.
         """
         uv = np.asarray(uv, dtype=np.float64)
         x = (uv - self.K[:2, 2]) @ self._inverse_focal.T
-        if self.model == 'equidistant' and x.size:
-            undistorted = cv2.fisheye.undistortPoints(x.reshape(-1, 1, 2), _EYE, self.D)
-            return np.asarray(undistorted, dtype=np.float64).reshape(x.shape)
         for _ in range(_STEPS):
             there, J = self.distort_linearised(x)
-            with np.errstate(divide='ignore', invalid='ignore'):
+            with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
                 step = (inverse_2x2(J) @ (uv - there)[..., None])[..., 0]
             x = x + step
             if np.abs(step).max(initial=0.0) < _SHORT:
@@ -178,6 +182,22 @@ class Camera:
         uv = np.asarray(uv, dtype=np.float64)
         last = self._last_pixel - margin_px
         return np.asarray(((uv >= margin_px) & (uv <= last)).all(axis=-1))
+
+    def shows(self, uv: npt.ArrayLike) -> BoolArray:
+        """Whether pixels (..., 2) show what lies less than 85 degrees off the axis, away from where the lens folds back."""
+        off_axis = np.asarray(uv, dtype=np.float64) - self.K[:2, 2]
+        if self._shown_px == math.inf:
+            return np.ones(off_axis.shape[:-1], dtype=np.bool_)
+        return np.asarray(np.hypot(off_axis[..., 0], off_axis[..., 1]) < self._shown_px)
+
+    @cached_property
+    def _shown_px(self) -> float:
+        """Radius [px] around the principal point that the lens shows; inf if that is all of the image."""
+        radius = min(_BEFORE_FOLD * self._fold_radius, math.tan(_WIDEST))
+        around = radius * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+        shown = float(np.linalg.norm(self.distort(around) - self.principal_point, axis=1).min())
+        corners = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]) * self._last_pixel
+        return shown if np.linalg.norm(corners - self.principal_point, axis=1).max() > shown else math.inf
 
     @cached_property
     def _fold_radius(self) -> float:

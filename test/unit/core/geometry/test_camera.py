@@ -123,6 +123,39 @@ def test_a_wide_fisheye_is_inverted_to_its_border():
     assert np.allclose(camera.distort(camera.normalise(uv)), uv, atol=1e-8)
 
 
+@pytest.mark.parametrize('D', [[0.0], [0.05], [-0.05], [0.1, -0.02, 0.005, -0.001], [-0.02, 0.01, -0.01, 0.002]])
+def test_a_fisheye_is_inverted_to_half_a_degree_from_the_hemisphere(D):
+    """OpenCV's inverse is off by a third at 85 degrees where the first coefficient is 0.05."""
+    angle = np.radians(np.linspace(0.0, 89.5, 180))[:, None]
+    camera = Camera(640, 512, np.array([[200.0, 0, 320], [0, 200.0, 256], [0, 0, 1]]), 'equidistant', D)
+    x = np.tan(angle) * [0.6, 0.8]
+    # Digits of the radius are lost as the cosine of the angle falls to 0.009, twice in the derivative.
+    assert np.allclose(camera.normalise(camera.distort(x)), x, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ('model', 'D', 'radius'),
+    [
+        # The hemisphere ends 157 px from the centre, 85 degrees are at 148 px.
+        ('equidistant', [0.0], 100.0 * np.radians(85.0)),
+        # x (1 - 0.3 x^2) folds back at x = 1.054; nine tenths of it are at 69.3 px.
+        ('plumb_bob', [-0.3], 100.0 * 0.9 * 1.0541 * (1.0 - 0.3 * (0.9 * 1.0541) ** 2)),
+    ],
+)
+def test_pixels_beyond_what_the_lens_can_show(model, D, radius):
+    camera = Camera(640, 512, np.array([[100.0, 0, 320], [0, 100.0, 256], [0, 0, 1]]), model, D)
+    uv = camera.principal_point + np.array(
+        [[0.0, radius - 0.1], [radius + 0.1, 0.0], [-0.6 * radius, 0.8 * radius + 0.1]]
+    )
+    assert camera.shows(uv).tolist() == [True, False, False]
+    assert camera.shows(uv[0])
+
+
+@every_model
+def test_a_lens_shows_all_of_its_image(name):
+    assert CAMERAS[name].shows([[0.0, 0.0], [639.0, 0.0], [639.0, 511.0], [1e6, 0.0]]).all()
+
+
 @every_model
 def test_points_move_in_both_coordinates(name):
     camera = CAMERAS[name]

@@ -220,6 +220,7 @@ def near_prediction(
     reading = decoder.read(frame.image, shown)
     limits = config.guided_min_correlation, config.guided_min_margin, config.guided_min_contrast * frame.noise
     good = (reading.ids == ids) & (reading.turns == 0) & reading.clear(*limits)
+    good &= frame.camera.shows(shown - displaced).all(axis=1)
     at = ImagePoints.at((shown - displaced)[good], frame.camera)
     places, no = Places.of(at, expected.depth[good]), np.zeros(len(at.px), dtype=bool)
     return FoundMarkers(ids[good], places, reading.contrast[good] / frame.noise, ~no, no)

@@ -110,7 +110,7 @@ class BlindSearch:
         reading, quads = self._read(frame, half, (fine, faint), allowed, found.ids if pull else None)
         good = accepted(reading, frame.noise, self._decoder.correctable, config)
         good &= (squared_sides(quads) >= min_side_px**2).all(axis=1)
-        good &= frame.camera.contains(quads, CUT_OFF_PX).all(axis=1)
+        good &= (frame.camera.contains(quads, CUT_OFF_PX) & frame.camera.shows(quads)).all(axis=1)
         if not good.any():
             return Outlines.none()
         good &= ~inside_out(reading, quads, good, distinct(reading, frame.noise, config))
