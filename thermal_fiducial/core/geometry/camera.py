@@ -184,7 +184,7 @@ class Camera:
         return np.asarray(((uv >= margin_px) & (uv <= last)).all(axis=-1))
 
     def shows(self, uv: npt.ArrayLike) -> BoolArray:
-        """Whether pixels (..., 2) show what lies less than 85 degrees off the axis, away from where the lens folds back."""
+        """Whether pixels (..., 2) show what lies less than 85 degrees off the axis and before the lens folds back."""
         off_axis = np.asarray(uv, dtype=np.float64) - self.K[:2, 2]
         if self._shown_px == math.inf:
             return np.ones(off_axis.shape[:-1], dtype=np.bool_)
