@@ -24,21 +24,23 @@ def chosen(args: argparse.Namespace) -> tuple[Gray, list[int]]:
         No such dictionary, or no such marker in it.
     """
     bits = load_dictionary(args.dictionary).bits
-    ids = list(range(len(bits))) if args.ids is None else _id_list(args.ids)
-    wrong = [marker_id for marker_id in ids if marker_id >= len(bits)]
-    if wrong:
-        raise InputError(f'{args.dictionary} has no marker {wrong[0]}: its IDs are 0 to {len(bits) - 1}')
+    ids = list(range(len(bits))) if args.ids is None else _id_list(args.ids, len(bits), args.dictionary)
     return bits, ids
 
 
-def _id_list(text: str) -> list[int]:
+def _id_list(text: str, count: int, dictionary: str) -> list[int]:
+    """IDs of ``text``, all of them among the ``count`` of the dictionary."""
     ids: list[int] = []
     for part in text.split(','):
-        first, dash, last = part.partition('-')
+        start, dash, end = part.partition('-')
         try:
-            ids += range(int(first), int(last if dash else first) + 1)
+            first, last = int(start), int(end if dash else start)
         except ValueError:
             raise InputError(f'--ids {text!r} is not a list like 0-7,12') from None
+        if last >= count:
+            # Before the list is made: it would fill the memory.
+            raise InputError(f'{dictionary} has no marker {max(first, count)}: its IDs are 0 to {count - 1}')
+        ids += range(first, last + 1)
     if not ids:
         raise InputError(f'--ids {text!r} names no marker')
     return ids

@@ -10,6 +10,7 @@ import numpy as np
 
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.subcommands import number
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
@@ -39,6 +40,10 @@ _OPTION_HELP = {
 }
 
 
+#: Type of a length of a sheet or between cuts [mm]: the widest sheets of acrylic are 2 to 3 m.
+_LENGTH = number(0.0, 10_000.0, 'mm')
+
+
 def add_make(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``markers make``."""
     parser.set_defaults(do=_make)
@@ -60,9 +65,11 @@ def add_sheet(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(do=_sheet)
     add_choice(parser)
     add_plate_options(parser)
-    parser.add_argument('--sheet', type=float, nargs=2, default=(1000.0, 600.0), metavar=('WIDTH', 'HEIGHT'), help='mm')
-    parser.add_argument('--spacing', type=float, default=5.0, metavar='MM', help='between markers')
-    parser.add_argument('--margin', type=float, default=10.0, metavar='MM', help='along the border of the sheet')
+    parser.add_argument(
+        '--sheet', type=_LENGTH, nargs=2, default=(1000.0, 600.0), metavar=('WIDTH', 'HEIGHT'), help='its size [mm]'
+    )
+    parser.add_argument('--spacing', type=_LENGTH, default=5.0, metavar='MM', help='between markers')
+    parser.add_argument('--margin', type=_LENGTH, default=10.0, metavar='MM', help='along the border of the sheet')
     _add_output(parser)
 
 
@@ -88,9 +95,9 @@ def add_board(parser: argparse.ArgumentParser) -> None:
         '--grid', type=int, nargs=2, metavar=('COLUMNS', 'ROWS'), help='default: 4 11 circles, 4 3 markers'
     )
     parser.add_argument(
-        '--spacing', type=float, metavar='MM', help='default: 25 between rows of circles, 40 between markers'
+        '--spacing', type=_LENGTH, metavar='MM', help='default: 25 between rows of circles, 40 between markers'
     )
-    parser.add_argument('--diameter', type=float, default=20.0, metavar='MM', help='of the circles')
+    parser.add_argument('--diameter', type=_LENGTH, default=20.0, metavar='MM', help='of the circles')
     parser.add_argument('--dictionary', default='STENCIL_4X4_100', help='of the markers')
     add_plate_options(parser, size=130.0)
     _add_output(parser)
@@ -100,7 +107,7 @@ def _board(args: argparse.Namespace) -> int:
     options = plate_options(args)
     columns, rows = args.grid or ((4, 11) if args.kind == 'circles' else (4, 3))
     if args.kind == 'circles':
-        spacing = args.spacing or 25.0
+        spacing = 25.0 if args.spacing is None else args.spacing
         _write_all([circle_board(columns, rows, spacing, args.diameter, options)], args)
         _say_how_to_use(f'circles --grid {columns} {rows} --spacing {spacing:g} --diameter {args.diameter:g}')
         return 0
@@ -108,7 +115,7 @@ def _board(args: argparse.Namespace) -> int:
     if columns < 1 or rows < 1 or columns * rows > len(bits):
         raise InputError(f'a board of {columns} x {rows} markers: {args.dictionary} has {len(bits)}')
     labels = [str(index) for index in range(columns * rows)]
-    centres = marker_grid(columns, rows, options.size, args.spacing or 40.0)
+    centres = marker_grid(columns, rows, options.size, 40.0 if args.spacing is None else args.spacing)
     base = base_plate(centres, labels, bits.shape[1] + 2, options)
     board = args.out / 'board.yaml'
     markers = [marker_drawing(bits[int(label)], label, options) for label in labels]
@@ -143,7 +150,9 @@ def add_plate_options(parser: argparse.ArgumentParser, size: float = PlateOption
     group.add_argument(
         '--quiet-cells', type=float, default=1.0, metavar='CELLS', help='width of the warm ring around the pattern'
     )
-    group.add_argument('--min-web', type=float, default=3.0, metavar='MM', help='least width of acrylic between holes')
+    group.add_argument(
+        '--min-web', type=_LENGTH, default=3.0, metavar='MM', help='least width of acrylic between holes'
+    )
 
 
 def plate_options(args: argparse.Namespace) -> PlateOptions:

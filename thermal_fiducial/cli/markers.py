@@ -13,7 +13,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bridges import darkest_white, find_bridges
 from thermal_fiducial.fabrication.cuttability import examine
 from thermal_fiducial.fabrication.dictionary_search import distances, negatives, search
-from thermal_fiducial.fabrication.plate import marker_drawing
+from thermal_fiducial.fabrication.plate import marker_drawing, PlateOptions
 from thermal_fiducial.fabrication.strength import strength_of
 from thermal_fiducial.files.dictionary import PACKAGED, save_dictionary
 from thermal_fiducial.files.writing import write_text
@@ -85,13 +85,15 @@ def _add_bridge(parser: argparse.ArgumentParser) -> None:
 
 
 def _bridge(args: argparse.Namespace) -> int:
+    # The lengths that can be drawn.
+    options = PlateOptions(size=args.size, bridge_width=args.bridge_width)
     bits, ids = chosen(args)
-    cell = args.size / (bits.shape[1] + 2)
+    cell = options.size / (bits.shape[1] + 2)
     table = table_of('', ('ID', 'patches', 'webs', 'longest web cells', 'read part of a white cell covered'))
     for marker_id in ids:
         bridges = find_bridges(bits[marker_id])
         longest = max((len(web) - 1 for web in bridges.webs), default=0)
-        covered = darkest_white(bits[marker_id], bridges, cell, args.bridge_width)
+        covered = darkest_white(bits[marker_id], bridges, cell, options.bridge_width)
         row = (marker_id, len(bridges.patches), len(bridges.webs), longest, f'{100 * covered:.0f} %')
         table.add_row(*map(str, row))
     show(table)

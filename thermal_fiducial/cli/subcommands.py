@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable
+import math
 from pathlib import Path
 from typing import TypeAlias
 
@@ -37,6 +38,21 @@ def whole_number(least: int) -> Callable[[str], int]:
         return value
 
     return number
+
+
+def number(least: float, most: float, unit: str = '') -> Callable[[str], float]:
+    """Type of an argument: a number from ``least`` to ``most`` [unit], which excludes NaN and infinity."""
+
+    def within(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f'{text!r} is not a number from {least:g} to {most:g} {unit}'.rstrip())
+        return value
+
+    return within
 
 
 def file_to_write(text: str) -> Path:

@@ -21,8 +21,12 @@ MOUNTS = ('ears', 'frame', 'none')
 
 # Width of acrylic around a mounting hole [mm]: the thickness of usual sheets, the least that a bolt may clamp.
 _WALL_MM = 3.0
-# Smallest side, and thicknesses that the nodes take, without foil [mm]: other numbers are probably in metres.
-_SMALLEST_MM, _THICKNESSES_MM = 5.0, (0.1, 50.0)
+# Sides and thicknesses that the nodes take, without foil [mm]: other numbers are probably of another unit.
+_SIZES_MM, _THICKNESSES_MM = (5.0, 10_000.0), (0.1, 50.0)
+_POSITIVE = ('hole_diameter', 'bridge_width', 'quiet_cells', 'frame_width', 'tie_width')
+_MAY_BE_ZERO = ('kerf', 'corner_radius', 'stand_off')
+# Lengths that leave nothing of a marker if they are longer than its side.
+_PARTS_OF_SIDE = ('hole_diameter', 'bridge_width', 'tie_width')
 # Width of a tab and length of its neck, in sides of the marker: the tab has room for the engraving, and the camera
 # resolves the warm background between tab and edge. Together they are below 12 % of a side, which OpenCV smooths away
 # in its search for squares.
@@ -58,28 +62,25 @@ class PlateOptions:
     def __post_init__(self) -> None:
         if self.mount not in MOUNTS:
             raise InputError(f'mount {self.mount!r} is not one of {", ".join(MOUNTS)}')
-        positive = (
-            self.size,
-            self.thickness,
-            self.hole_diameter,
-            self.bridge_width,
-            self.quiet_cells,
-            self.frame_width,
-            self.tie_width,
-        )
-        if (
-            not all(np.isfinite(positive))
-            or min(positive) <= 0
-            or min(self.kerf, self.corner_radius, self.stand_off) < 0
-        ):
-            raise InputError('lengths of a marker plate must be positive')
-        if self.size < _SMALLEST_MM:
-            raise InputError(f'a marker of {self.size:g} mm: sizes are in millimetres, {_SMALLEST_MM:g} and more')
+        if not _SIZES_MM[0] <= self.size <= _SIZES_MM[1]:
+            allowed = '{:g} to {:g}'.format(*_SIZES_MM)
+            raise InputError(f'a marker of {self.size:g} mm: sizes are in millimetres, {allowed}')
         if not _THICKNESSES_MM[0] <= self.thickness <= _THICKNESSES_MM[1]:
             allowed = '{:g} to {:g}'.format(*_THICKNESSES_MM)
             raise InputError(f'a plate of {self.thickness:g} mm: thicknesses are in millimetres, {allowed}')
+        self._require_lengths()
         if self.mount == 'frame' and self.frame_width < self.hole_diameter + _WALL_MM:
             raise InputError(f'a frame of {self.frame_width:g} mm has no room for holes of {self.hole_diameter:g} mm')
+
+    def _require_lengths(self) -> None:
+        """Require lengths that a plate may have, which excludes NaN and infinity."""
+        for name in (*_POSITIVE, *_MAY_BE_ZERO):
+            value, words = getattr(self, name), name.replace('_', ' ')
+            if not 0.0 <= value <= _SIZES_MM[1] or (name in _POSITIVE and value == 0.0):
+                least = 'more than 0' if name in _POSITIVE else '0 or more'
+                raise InputError(f'{words} of a plate: {value:g} is not {least}, {_SIZES_MM[1]:g} at most')
+            if name in _PARTS_OF_SIDE and value > self.size:
+                raise InputError(f'{words} of a plate: {value:g} mm is more than its side, {self.size:g} mm')
 
 
 def marker_rectangles(bits: Gray, options: PlateOptions) -> list[Rectangle]:

@@ -434,6 +434,55 @@ def test_sizes_in_metres_and_a_file_in_the_place_of_the_folder_are_named(tmp_pat
     for thickness in ('0.003', '300'):
         assert main(['markers', 'make', '--ids', '1', '--thickness', thickness, '--out', str(tmp_path / 'plates')]) == 2
         assert f'a plate of {thickness} mm: thicknesses are in millimetres' in capsys.readouterr().err
+    for size in ('30000', 'nan', 'inf', '-300'):
+        assert main(['markers', 'bridge', '--ids', '1', '--size', size]) == 2
+        assert f'a marker of {float(size):g} mm: sizes are in millimetres, 5 to 10000' in capsys.readouterr().err
     (tmp_path / 'file').write_text('')
     assert main(['markers', 'make', '--ids', '1', '--out', str(tmp_path / 'file')]) == 2
     assert f'{tmp_path}/file: File exists' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('option', 'value', 'says'),
+    [
+        ('--kerf', 'nan', 'kerf of a plate: nan is not 0 or more, 10000 at most'),
+        ('--kerf', 'inf', 'kerf of a plate: inf is not'),
+        ('--corner-radius', 'nan', 'corner radius of a plate: nan'),
+        ('--stand-off', 'inf', 'stand off of a plate: inf'),
+        ('--quiet-cells', '0', 'quiet cells of a plate: 0 is not more than 0'),
+        ('--hole-diameter', '1e6', 'hole diameter of a plate: 1e+06 is not'),
+        ('--tie-width', '301', 'tie width of a plate: 301 mm is more than its side, 300 mm'),
+        ('--ids', '0-999999999999', 'STENCIL_4X4_100 has no marker 100: its IDs are 0 to 99'),
+    ],
+)
+def test_lengths_that_no_plate_has_and_markers_that_no_dictionary_has_are_refused(
+    tmp_path, capsys, option, value, says
+):
+    out = tmp_path / 'plates'
+    options = {'--ids': '0', '--formats': 'svg', option: value}
+    assert main(['markers', 'make', '--out', str(out), *(word for pair in options.items() for word in pair)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    'options',
+    [
+        ['make', '--min-web', 'nan'],
+        ['sheet', '--sheet', '1000', '-600'],
+        ['sheet', '--spacing', '-5'],
+        ['sheet', '--margin', 'inf'],
+        ['board', 'circles', '--diameter', '-20'],
+    ],
+)
+def test_lengths_of_sheets_are_no_negative_ones(tmp_path, capsys, options):
+    with pytest.raises(SystemExit) as ended:
+        main(['markers', *options, '--out', str(tmp_path / 'plates')])
+    assert ended.value.code == 2
+    assert 'is not a number from 0 to 10000 mm' in capsys.readouterr().err
+
+
+def test_a_board_without_spacing_is_not_one_of_the_default(tmp_path, capsys):
+    assert main(['markers', 'board', 'circles', '--spacing', '0', '--out', str(tmp_path / 'board')]) == 2
+    assert 'a millimetre of acrylic between them' in capsys.readouterr().err
