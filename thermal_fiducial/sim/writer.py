@@ -1,8 +1,6 @@
 """A simulated flight as a rosbag2, with all files that its replay needs."""
 
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, fields
 import heapq
@@ -15,7 +13,6 @@ import shutil
 import signal
 import tempfile
 import threading
-import time
 from typing import Any
 
 import cv2
@@ -109,7 +106,7 @@ def write_flight(
         (folder / out.name).rename(out)
     except OSError as error:
         raise InputError(f'{out}: {error.strerror}') from None
-    except BrokenExecutor:
+    except RendererDiedError:
         raise InputError(f'{out}: a rendering process died, perhaps for lack of memory') from None
     finally:
         shutil.rmtree(folder)
@@ -174,39 +171,9 @@ def _arrivals(record: ImuRecord, stamps: IntArray, scenario: Scenario) -> list[i
 
 # --- rendering in chunks ------------------------------------------------------------------------------
 
-#: The camera of a worker process, created once, since its tables of rays take a second.
-_worker_camera: list[ThermalCamera] = []
-#: In a worker process: whether nobody waits for its frames any more.
-_worker_ends = threading.Event()
-#: Interval at which a worker that is to end looks whether the parent still lives [s].
-_GLANCE_S = 0.1
 
-
-def _start_worker(flight: FlightPlan, lifeline: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process ends us
-    threading.Thread(target=_end_with, args=(lifeline, os.getppid()), daemon=True).start()
-    cv2.setNumThreads(1)
-    _worker_camera[:] = [ThermalCamera(flight)]
-
-
-def _end_with(lifeline: Connection, parent: int) -> None:
-    """Stop rendering when the parent closes ``lifeline``; end this worker once the parent has ended in any way.
-
-    Not before: the parent would wait for ever for the rest of a result that was being sent.
-    """
-    with suppress(EOFError, OSError):
-        lifeline.recv()
-    _worker_ends.set()
-    while os.getppid() == parent:
-        time.sleep(_GLANCE_S)
-    os._exit(1)
-
-
-def _render_chunk(start: int, stop: int) -> list[SimFrame]:
-    if _worker_ends.is_set():
-        return []
-    frames = _worker_camera[0].frames(start, stop)
-    return list(takewhile(lambda _: not _worker_ends.is_set(), frames))
+class RendererDiedError(Exception):
+    """A rendering process ended before it had sent its frames."""
 
 
 def _frames(flight: FlightPlan, workers: int) -> Generator[SimFrame, None, None]:
@@ -214,17 +181,62 @@ def _frames(flight: FlightPlan, workers: int) -> Generator[SimFrame, None, None]
         yield from ThermalCamera(flight).frames(0, flight.frame_count)
         return
     starts = list(range(0, flight.frame_count, CHUNK))
-    stops = [min(start + CHUNK, flight.frame_count) for start in starts]
+    with _rendering(flight, starts, min(workers, len(starts))) as pipes:
+        for index in range(len(starts)):
+            try:
+                chunk = pipes[index % len(pipes)].recv()
+            except (EOFError, OSError):
+                raise RendererDiedError from None
+            if isinstance(chunk, Exception):
+                raise chunk
+            yield from chunk
+
+
+@contextmanager
+def _rendering(flight: FlightPlan, starts: Sequence[int], count: int) -> Iterator[list[Connection]]:
+    """Processes that send the chunks of frames that begin at ``starts``, in turns, each through a pipe of its own.
+
+    The only other end of a pipe is in its process: when that ends in any way, even half-way through a chunk, so does
+    the pipe. Of the pools of Python all workers share one pipe, which stays open, and whoever reads it waits for ever.
+    """
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')  # a worker is to use one core
     context = multiprocessing.get_context('spawn')  # a fork of a process that runs ROS deadlocks
-    lifeline, theirs = context.Pipe()
-    # Left in the reverse order: the workers stop rendering before the pool waits for them, also with an error.
-    with ProcessPoolExecutor(min(workers, len(starts)), context, _start_worker, (flight, theirs)) as pool, lifeline:
+    pipes, workers = [], []
+    try:
+        # Its children inherit this: an interrupt may reach them before their first line.
         with _interrupts_ignored():
-            # Its children inherit this: an interrupt may reach them before their first line.
-            chunks = deque(pool.submit(_render_chunk, *span) for span in zip(starts, stops, strict=True))
-        while chunks:
-            yield from chunks.popleft().result()
+            for first in range(count):
+                ours, theirs = context.Pipe(duplex=False)
+                pipes.append(ours)
+                with theirs:
+                    arguments = (flight, starts[first::count], theirs, os.getpid())
+                    workers.append(context.Process(target=_render, args=arguments, daemon=True))
+                    workers[-1].start()
+        yield pipes
+    finally:
+        for worker in workers:
+            if worker.pid is not None:
+                worker.kill()
+                worker.join()
+        for pipe in pipes:
+            pipe.close()
+
+
+def _render(flight: FlightPlan, starts: Sequence[int], pipe: Connection, parent: int) -> None:
+    """Send the chunks that begin at ``starts``, or what went wrong; end with the ``parent``."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process ends us
+    cv2.setNumThreads(1)
+    # Nobody waits for the frames when the parent has been killed.
+    with suppress(BrokenPipeError):
+        try:
+            camera = ThermalCamera(flight)
+            for start in starts:
+                frames = camera.frames(start, min(start + CHUNK, flight.frame_count))
+                pipe.send(list(takewhile(lambda _: os.getppid() == parent, frames)))
+        except BrokenPipeError:
+            raise
+        except Exception as error:  # raised by the parent, whatever it is
+            pipe.send(error)
 
 
 @contextmanager

@@ -1,5 +1,8 @@
 from dataclasses import replace
 import math
+import multiprocessing
+import os
+import signal
 import sys
 import time
 
@@ -175,7 +178,7 @@ def threads_wait():
 @pytest.mark.slow
 @pytest.mark.usefixtures('threads_wait')
 def test_workers_that_are_sending_frames_do_not_hold_up_an_error(tmp_path):
-    """Had they ended at once, half a result would be in the pipe, and the rest of it waited for for ever."""
+    """They block at full pipes meanwhile, and end all the same."""
 
     def full_disk(count):
         until = time.monotonic() + 2.0
@@ -187,6 +190,31 @@ def test_workers_that_are_sending_frames_do_not_hold_up_an_error(tmp_path):
     with pytest.raises(InputError, match='no space left'):
         write_flight(tmp_path / 'bag', plan(BEHIND, 8.0, 3, quality=COARSE), workers=4, progress=full_disk)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures('threads_wait')
+@pytest.mark.timeout(60, method='thread')
+def test_a_worker_that_is_killed_while_it_sends_frames_ends_the_command(tmp_path):
+    """As for lack of memory: half a result is in its pipe, and the rest of it never comes."""
+
+    workers = []
+
+    def out_of_memory(count):
+        if workers:
+            return
+        workers.extend(multiprocessing.active_children())
+        until = time.monotonic() + 2.0
+        while time.monotonic() < until:
+            # Meanwhile the workers send, and nobody reads.
+            pass
+        for worker in workers:
+            os.kill(worker.pid, signal.SIGKILL)
+
+    with pytest.raises(InputError, match='a rendering process died, perhaps for lack of memory'):
+        write_flight(tmp_path / 'bag', plan(BEHIND, 8.0, 3, quality=COARSE), workers=2, progress=out_of_memory)
+    assert not list(tmp_path.iterdir())
+    assert not multiprocessing.active_children()
 
 
 def test_nothing_is_left_of_a_failed_flight(tmp_path):
