@@ -6,12 +6,13 @@ import signal
 import threading
 import time
 
+import numpy as np
 import pytest
 from support import small_bag
 from support.interrupts import interrupted
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.files.bags import IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map
 
 pytest.importorskip('distributed', reason='the extra "batch" is not installed')
@@ -22,6 +23,10 @@ pytestmark = [
     pytest.mark.filterwarnings('ignore::ResourceWarning', 'ignore::DeprecationWarning'),
     pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning'),
 ]
+
+
+#: Factors of the nine numbers of a camera matrix: the image enlarged.
+ZOOM = np.repeat((1.5, 1.5, 1.0), 3)
 
 
 @pytest.fixture(scope='module')
@@ -120,6 +125,35 @@ def test_all_arguments_that_are_no_bags_are_named_before_any_is_replayed(folder,
     for words in ('empty: no bag', 'map.yaml: no bag', 'no_imu: no topic imu/data'):
         assert words in error
     assert not (folder / 'nothing').exists()
+
+
+def test_bags_of_different_calibrations_are_named_before_any_is_replayed(folder, capfd):
+    zoomed = small_bag.recording(seconds=0.1)
+    zoomed.events = [
+        (stamp, topic, small_bag.replaced(message, k=ZOOM * message.k) if topic == CAMERA_INFO_TOPIC else message)
+        for stamp, topic, message in zoomed.events
+    ]
+    zoomed.write(folder / 'zoomed')
+    assert batch(folder, 'mixed', bags=('flight0', 'zoomed', 'flight1')) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert line == 'thermal-fiducial batch: zoomed has another calibration than flight0: no joint map'
+    assert not (folder / 'mixed').exists()
+
+
+def test_a_bag_whose_calibration_is_none_is_named(folder, capfd):
+    recording = small_bag.recording(seconds=0.1)
+    recording.events = [
+        (
+            stamp,
+            topic,
+            small_bag.Raw('sensor_msgs/msg/CameraInfo', b'\0' * 8) if topic == CAMERA_INFO_TOPIC else message,
+        )
+        for stamp, topic, message in recording.events
+    ]
+    recording.write(folder / 'no_lens')
+    assert batch(folder, 'lensless', bags=('no_lens',)) == 2
+    assert 'no_lens: ' in capfd.readouterr().err
+    assert not (folder / 'lensless').exists()
 
 
 def test_no_folder_is_left_where_no_bag_could_be_replayed(folder, capfd):

@@ -31,7 +31,7 @@ from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.replay.earlier_runs import refuse_other_folder
 from thermal_fiducial.replay.session import check, MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
-from thermal_fiducial.ros.messages import clouds, convert
+from thermal_fiducial.ros.messages import clouds, convert, message_bytes
 from thermal_fiducial.ros.process.interrupts import Interrupts
 
 #: Written last; it and the map of an earlier batch are deleted before the first replay.
@@ -91,6 +91,7 @@ class Batch:
         if (self.out / MAP_FILE).exists() and not (self.out / SUMMARY_FILE).exists():
             raise InputError(f'{self.out / MAP_FILE} is not of an earlier batch: choose another folder with --out')
         self._check_bags(runs)
+        _common_camera(runs, read_settings(self.options.params, {}))
 
     @contextmanager
     def cleared_up(self) -> Iterator[None]:
@@ -275,24 +276,42 @@ def replay_whole(options: Options) -> list[str]:
 def _joint_map(batch: Batch, runs: Sequence[Options], settings: Settings) -> tuple[Built, int]:
     config = replace(settings.marker_mapper, mode='mapping')
     start = load_map(Path(str(batch.options.map_file)), config.marker_size)
-    cameras = [_camera(run, settings) for run in runs]
-    for run, camera in zip(runs, cameras, strict=True):
-        if not camera.matches(cameras[0]):
-            raise InputError(f'{run.run.name} has another calibration than {runs[0].run.name}: no joint map')
+    camera = _common_camera(runs, settings)
     share = max(batch.max_frames // len(runs), 1)
     frames = [rows for run in runs for rows in _frames(run, share)]
     if not frames:
         raise InputError('no markers in any of the bags')
-    return build_map(frames, cameras[0], start, config), len(frames)
+    return build_map(frames, camera, start, config), len(frames)
+
+
+def _common_camera(runs: Sequence[Options], settings: Settings) -> Camera:
+    """The camera of all bags.
+
+    Raises
+    ------
+    InputError
+        A bag without calibration, or bags with different ones.
+    """
+    cameras = [_camera(run, settings) for run in runs]
+    others = [run.run.name for run, camera in zip(runs, cameras, strict=True) if not camera.matches(cameras[0])]
+    if others:
+        have = 'has' if len(others) == 1 else 'have'
+        raise InputError(f'{", ".join(others)} {have} another calibration than {runs[0].run.name}: no joint map')
+    return cameras[0]
 
 
 def _camera(run: Options, settings: Settings) -> Camera:
+    """The first usable calibration of a bag, unless the parameters name a file: the nodes pass over others, too."""
     if settings.tau2_camera.calibration_file:
         return load_camera(settings.tau2_camera.calibration_file)
+    reason = f'no message on {CAMERA_INFO_TOPIC}'
     with BagReader(run.bag, run.remaps) as bag:
         for message in bag.messages([CAMERA_INFO_TOPIC]):
-            return convert.camera(deserialize_message(message.cdr, CameraInfo))
-    raise InputError(f'{run.bag}: no message on {CAMERA_INFO_TOPIC}')
+            try:
+                return convert.camera(message_bytes.read(message.cdr, CameraInfo, 'camera_info'))
+            except InputError as error:
+                reason = str(error)
+    raise InputError(f'{run.bag}: {reason}')
 
 
 def _frames(run: Options, most: int) -> list[Markers]:
