@@ -61,6 +61,7 @@ def param(
         description += f' Needs {" and ".join(needs)}.'
     metadata = {
         'description': f'{description} [{unit}]' if unit else description,
+        'unit': unit,
         'minimum': minimum,
         'maximum': maximum,
         'choices': choices,
@@ -158,7 +159,8 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
     low, high = limits['minimum'], limits['maximum']
     for element in result if isinstance(result, tuple) else (result,):
         if (low is not None and not element >= low) or (high is not None and not element <= high):
-            raise InputError(f'parameter {name}: {_shown(element)} is outside {low} .. {high}')
+            allowed = f'{low} .. {high} {limits["unit"]}'.rstrip()
+            raise InputError(f'parameter {name}: {_shown(element)} is outside {allowed}')
     if limits['normed'] and not abs(math.hypot(*result) - 1.0) < _NORM_TOLERANCE:
         raise InputError(f'parameter {name}: {list(result)} is no unit quaternion')
     if limits['verify']:
@@ -618,11 +620,19 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
 class ImuNoise(SelfChecked):
     """Continuous noise densities of the IMU, under Kalibr's names and units."""
 
-    gyroscope_noise_density: float = param(1.7e-4, 'Gyroscope white noise.', unit='rad/s/sqrt(Hz)', minimum=0.0)
-    accelerometer_noise_density: float = param(2.0e-3, 'Accelerometer white noise.', unit='m/s^2/sqrt(Hz)', minimum=0.0)
-    gyroscope_random_walk: float = param(2.0e-5, 'Gyroscope bias random walk.', unit='rad/s^2/sqrt(Hz)', minimum=0.0)
+    # Upper bounds: the largest that visual-inertial odometry is run with (VINS, D2SLAM) are 0.05, 0.2, 4e-4 and 0.02,
+    # which allow for vibration; what is beyond twice that is of another unit.
+    gyroscope_noise_density: float = param(
+        1.7e-4, 'Gyroscope white noise.', unit='rad/s/sqrt(Hz)', minimum=0.0, maximum=0.1
+    )
+    accelerometer_noise_density: float = param(
+        2.0e-3, 'Accelerometer white noise.', unit='m/s^2/sqrt(Hz)', minimum=0.0, maximum=1.0
+    )
+    gyroscope_random_walk: float = param(
+        2.0e-5, 'Gyroscope bias random walk.', unit='rad/s^2/sqrt(Hz)', minimum=0.0, maximum=0.01
+    )
     accelerometer_random_walk: float = param(
-        3.0e-4, 'Accelerometer bias random walk.', unit='m/s^3/sqrt(Hz)', minimum=0.0
+        3.0e-4, 'Accelerometer bias random walk.', unit='m/s^3/sqrt(Hz)', minimum=0.0, maximum=0.1
     )
     gyroscope_scale_std: float = param(
         0.005,

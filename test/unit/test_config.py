@@ -190,6 +190,24 @@ def test_what_does_not_fit_is_refused_by_name(values, words):
     [
         (lambda: PoseEkfConfig(gravity=12.0), 'parameter gravity: 12.0 is outside 9.7 .. 9.9'),
         (lambda: replace(PoseEkfConfig(), initial_poses=2.5), 'parameter initial_poses: 2.5 is not of type int'),
+        (
+            lambda: MarkerMapperConfig(marker_size=300.0),
+            'parameter marker_size: 300.0 is outside 0.005 .. 10.0 m',
+        ),
+        (
+            # A data sheet's 4 mdps/sqrt(Hz), and 160 ug/sqrt(Hz).
+            lambda: ImuNoise(gyroscope_noise_density=4.0),
+            'parameter gyroscope_noise_density: 4.0 is outside 0.0 .. 0.1 rad/s/sqrt(Hz)',
+        ),
+        (
+            lambda: ImuNoise(accelerometer_noise_density=160.0),
+            'parameter accelerometer_noise_density: 160.0 is outside 0.0 .. 1.0 m/s^2/sqrt(Hz)',
+        ),
+        # Wrong by 1000.
+        (lambda: ImuNoise(gyroscope_noise_density=0.17), 'gyroscope_noise_density: 0.17 is outside'),
+        (lambda: ImuNoise(accelerometer_noise_density=2.0), 'accelerometer_noise_density: 2.0 is outside'),
+        (lambda: ImuNoise(gyroscope_random_walk=0.02), 'gyroscope_random_walk: 0.02 is outside'),
+        (lambda: ImuNoise(accelerometer_random_walk=0.3), 'accelerometer_random_walk: 0.3 is outside'),
         (lambda: ImuNoise(vibration=-1.0), 'parameter vibration: -1.0 is outside'),
         (lambda: ArucoDetectorConfig(marker_size_overrides=('7',)), 'parameter marker_size_overrides'),
         (lambda: MarkerMapperConfig(mode='surveying'), "parameter mode: 'surveying' is not one of"),

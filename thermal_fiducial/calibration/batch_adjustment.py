@@ -11,10 +11,9 @@ from itertools import pairwise
 import numpy as np
 
 from thermal_fiducial.calibration.banded_equations import BandedEquations
-from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, preintegrate
+from thermal_fiducial.calibration.preintegration import AXES, Densities, ImuTrack, preintegrate
 from thermal_fiducial.calibration.rig_state import horizontal, imu_errors, OF_ALL, OF_FRAME, State
 from thermal_fiducial.calibration.rolling import RowMoments
-from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -78,7 +77,7 @@ class Problem:
         measured: FloatArray,
         root: FloatArray,
         imu: ImuTrack,
-        noise: ImuNoise,
+        noise: Densities,
         rows: RowMoments | None = None,
         readout: float = 0.0,
         jitter: float = 0.0,

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.calibration.batch_adjustment import Problem, root_information, Solution
-from thermal_fiducial.calibration.preintegration import AXES, ImuTrack
+from thermal_fiducial.calibration.preintegration import AXES, Densities, ImuTrack
 from thermal_fiducial.calibration.rig_state import first_state, LARGEST_OFFSET, State
 from thermal_fiducial.calibration.rolling import FrameCorners, RowMoments, SolvedFrame
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
@@ -130,7 +130,7 @@ def _rolling(
     recording: '_RigRecording',
     solved: list[SolvedFrame],
     camera: Camera,
-    noise: ImuNoise,
+    noise: Densities,
     jitter: float = 0.0,
     state: State | None = None,
 ) -> tuple[list[SolvedFrame], Problem, Solution]:
@@ -207,7 +207,7 @@ class _RigRecording:
     def solved(
         self,
         poses: Sequence[CameraPose],
-        noise: ImuNoise,
+        noise: Densities,
         jitter: float = 0.0,
         state: State | None = None,
         rows: Sequence[RowMoments] | None = None,

@@ -4,7 +4,8 @@ C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, "On-manifold preintegration 
 odometry", 2017, section VI, for all intervals at once.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -19,6 +20,20 @@ _STEP = 0.005
 AXES = 15
 # Variance of the second difference of white noise of variance one.
 _SECOND_DIFFERENCE = 6.0
+
+
+@dataclass(frozen=True)
+class SampleNoise:
+    """Noise densities of recorded samples, as in :class:`ImuNoise`; vibration may exceed what any IMU has at rest."""
+
+    gyroscope_noise_density: float
+    accelerometer_noise_density: float
+    gyroscope_random_walk: float
+    accelerometer_random_walk: float
+
+
+#: Noise densities as they are declared, or as recorded samples show them.
+Densities: TypeAlias = ImuNoise | SampleNoise
 
 
 @dataclass(frozen=True)
@@ -56,17 +71,18 @@ class ImuTrack:
         by_axes = axis_errors(self.rate, self.force) @ axes
         return ImuTrack(self.seconds, self.rate - by_axes[:, :3], self.force - by_axes[:, 3:])
 
-    def noise(self, known: ImuNoise) -> ImuNoise:
+    def noise(self, known: ImuNoise) -> SampleNoise:
         """``known`` with the white noise estimated from the samples, where vibration increases it."""
         root = float(np.median(np.diff(self.seconds))) ** 0.5
         rate, force = (
             root * float(np.sqrt(np.mean(np.diff(signal, 2, axis=0) ** 2) / _SECOND_DIFFERENCE))
             for signal in (self.rate, self.force)
         )
-        return replace(
-            known,
-            gyroscope_noise_density=max(rate, known.gyroscope_noise_density),
-            accelerometer_noise_density=max(force, known.accelerometer_noise_density),
+        return SampleNoise(
+            max(rate, known.gyroscope_noise_density),
+            max(force, known.accelerometer_noise_density),
+            known.gyroscope_random_walk,
+            known.accelerometer_random_walk,
         )
 
 
@@ -106,7 +122,7 @@ class Increments:
     covariance: FloatArray
 
 
-def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: ImuNoise) -> Increments:
+def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: Densities) -> Increments:
     """Increments between ``times`` (K + 1,) [s, IMU's clock].
 
     Parameters

@@ -4,8 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, Increments
-from thermal_fiducial.config import ImuNoise
+from thermal_fiducial.calibration.preintegration import AXES, Densities, ImuTrack, Increments
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
@@ -72,7 +71,7 @@ def horizontal(gravity: FloatArray) -> FloatArray:
 
 
 def imu_errors(
-    state: State, increments: Increments, noise: ImuNoise
+    state: State, increments: Increments, noise: Densities
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Whitened errors (K, 15) of consecutive states, and derivatives by the first, the second and the shared ones."""
     count = len(increments.dt)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thermal_fiducial.config import ImuNoise, parameters
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE, require_usable
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
@@ -22,8 +23,8 @@ NOISE_NAMES = (
     'gyroscope_random_walk',
     'accelerometer_random_walk',
 )
-# Limit of the noise densities, in any of their units: above any sensor.
-_LARGEST_NOISE = 100.0
+#: Largest noise densities, as the nodes take them.
+_LARGEST_NOISE = {name: item.metadata['maximum'] for name, item, _ in parameters(ImuNoise) if name in NOISE_NAMES}
 _LONGEST_SIDE, LARGEST_MARKER_M, _LARGEST_OFFSET_S = 65_535, 100.0, 1.0
 #: Header of OpenCV in some of EuRoC's files, which YAML 1.1 does not allow.
 _OPENCV_HEAD = '%YAML:1.0'
@@ -193,4 +194,4 @@ def _noise(section: Value | None) -> dict[str, float]:
     if section is None:
         return {}
     fields = section.mapping()
-    return {name: fields[name].number(0.0, _LARGEST_NOISE) for name in NOISE_NAMES if name in fields}
+    return {name: fields[name].number(0.0, _LARGEST_NOISE[name]) for name in NOISE_NAMES if name in fields}

@@ -8,7 +8,7 @@ from support.scenes import camera_of
 
 from thermal_fiducial.calibration.batch_adjustment import Problem
 from thermal_fiducial.calibration.camera_imu import calibrate_camera_imu, calibrate_rolling_camera_imu
-from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, preintegrate
+from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, preintegrate, SampleNoise
 from thermal_fiducial.calibration.rig_state import first_state, imu_errors
 from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.config import ImuNoise
@@ -299,7 +299,16 @@ def test_white_noise_is_estimated_from_the_samples():
     assert noise.gyroscope_noise_density == pytest.approx(0.015 / np.sqrt(200.0), rel=0.05)
     assert noise.accelerometer_noise_density == pytest.approx(0.3 / np.sqrt(200.0), rel=0.05)
     assert noise.gyroscope_random_walk == 1e-4
-    assert imu.noise(ImuNoise(1.0, 2.0)) == ImuNoise(1.0, 2.0)
+    assert imu.noise(ImuNoise(0.05, 0.5, 1e-4, 1e-3)) == SampleNoise(0.05, 0.5, 1e-4, 1e-3)
+
+
+def test_samples_may_shake_by_more_than_any_imu_has_at_rest():
+    shaking = replace(SCENARIO.imu, gyroscope_rattle=3.0, accelerometer_rattle=30.0)
+    _, imu = recording(replace(SCENARIO, imu=shaking), 20.0, 1)
+    noise = imu.noise(ImuNoise())
+    # As above.
+    assert noise.gyroscope_noise_density == pytest.approx(3.0 / np.sqrt(200.0), rel=0.05)
+    assert noise.accelerometer_noise_density == pytest.approx(30.0 / np.sqrt(200.0), rel=0.05)
 
 
 def test_poses_alone_say_nothing_of_the_readout_time():

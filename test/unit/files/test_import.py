@@ -228,6 +228,15 @@ def test_an_invalid_transform_is_refused(ours, capsys):
     assert 'no rigid transform' in capsys.readouterr().err
 
 
+def test_noise_densities_that_the_nodes_refuse_are_refused(ours, capsys):
+    (ours / 'rig.yaml').write_text(yaml.safe_dump(rig() | {'imu': {'gyroscope_noise_density': 4.0}}))
+    assert run(ours) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'gyroscope_noise_density' in line
+    assert '0.1' in line
+    assert not (ours.parent / 'bag').exists()
+
+
 @pytest.mark.parametrize('variance', [0.0, -1.0, 1e300])
 def test_poses_without_a_covariance_are_refused(ours, capsys, variance):
     numbers = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *(variance * np.eye(6)).ravel()]
