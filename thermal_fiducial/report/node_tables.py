@@ -20,6 +20,11 @@ _UNITS = {
     'accelerometer scale error': '1',
     'map tilt': 'rad',
 }
+#: Figures of one name and two units, as names of their own.
+_VIBRATION = {
+    'vibration rad/s/sqrt(Hz)': ('gyroscope noise under vibration', 'rad/s/sqrt(Hz)'),
+    'vibration m/s^2/sqrt(Hz)': ('accelerometer noise under vibration', 'm/s^2/sqrt(Hz)'),
+}
 #: Figures left out: the table of innovations has them for the whole run, the nodes only for the latest poses.
 _ELSEWHERE = ('received ', 'published ', 'poses accepted', 'poses refused', 'NIS per d.o.f.', INNOVATIONS)
 
@@ -59,8 +64,8 @@ def figures_tables(evaluation: Evaluation) -> dict[str, Table]:
 def _split(name: str, value: str) -> tuple[str, str, str]:
     """Name without unit, value and unit of a figure."""
     unit = _UNITS.get(name, 'count' if value.isdigit() else '')
-    if name.startswith('vibration '):
-        name, unit = 'vibration', name.removeprefix('vibration ')
+    if name in _VIBRATION:
+        name, unit = _VIBRATION[name]
     elif name.endswith(']'):
         name, _, unit = name[:-1].rpartition(' [')
     return name, _rounded(value), unit

@@ -335,7 +335,7 @@ def test_figures_and_load_of_the_nodes(small_run):
     assert made['figures of tau2_camera'].rows == [
         ('withheld: FFC', '12', 'count'),
         ('rate /thermal/image_raw', '29.9', 'Hz'),
-        ('vibration', '0.001813', 'm/s^2/sqrt(Hz)'),
+        ('accelerometer noise under vibration', '0.001813', 'm/s^2/sqrt(Hz)'),
         ('map tilt', '0.000009', 'rad'),
     ]
     assert made['figures of pose_ekf'].rows == [('in view', '2, 3', '')]

@@ -183,6 +183,14 @@ frame.onload = () => {
   const wide = [...page.querySelectorAll('.scroll:not(.wide)')].filter((part) => part.scrollWidth > part.clientWidth);
   document.body.dataset.width = page.documentElement.scrollWidth;
   document.body.dataset.wide = wide.map((part) => part.querySelector('caption').textContent).join('|');
+  const lines = (cell) => {
+    const range = page.createRange();
+    range.selectNodeContents(cell);
+    return range.getClientRects().length;
+  };
+  const words = [...page.querySelectorAll('td')].filter((cell) => /^[a-z]{1,9}$/.test(cell.textContent));
+  const broken = words.filter((cell) => lines(cell) > 1);
+  document.body.dataset.broken = broken.map((cell) => cell.textContent).join('|');
 };
 </script>"""
 
@@ -207,11 +215,13 @@ def test_nothing_is_wider_than_a_phone(run_folder, tmp_path):
         (tmp_path / 'phone.html').as_uri(),
     ]  # fmt: skip
     dom = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False).stdout
-    found = re.search(r'<body[^>]*data-width="(\d+)" data-wide="([^"]*)"', dom)
+    found = re.search(r'<body[^>]*data-width="(\d+)" data-wide="([^"]*)" data-broken="([^"]*)"', dom)
     assert found, dom[-2000:]
     # The width of the frame.
     assert int(found[1]) <= 390
     assert found[2] == ''
+    # Units and other short words stay on one line.
+    assert found[3] == ''
 
 
 @pytest.mark.slow
