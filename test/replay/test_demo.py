@@ -53,6 +53,17 @@ def test_a_short_demo(tmp_path, capfd, monkeypatch, scenario, seconds):
     assert picture.stat().st_size < 400_000
 
 
+@pytest.mark.parametrize(
+    ('name', 'says'),
+    [('nowhere/a.png', 'no folder'), ('a.xyz', 'not the name of a PNG'), ('.', 'not the name of a PNG')],
+)
+def test_a_picture_that_cannot_be_written_is_refused_before_the_flight(tmp_path, capsys, name, says):
+    assert main(['demo', '--out', str(tmp_path / 'demo'), '--picture', str(tmp_path / name)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert says in line
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_of_somebody_else_is_never_replaced(tmp_path, capsys):
     (tmp_path / 'thesis.tex').write_text('years of work')
     assert main(['demo', '--out', str(tmp_path)]) == 2

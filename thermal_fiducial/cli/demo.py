@@ -73,10 +73,19 @@ def _check_packages(args: argparse.Namespace) -> None:
         raise InputError(f'the demo runs the ROS 2 nodes and finds no {missing[0]}: install the extra "ros"')
     if args.picture is not None:
         require_plots('--picture')
+        _check_picture(args.picture, args.out)
     if args.video:
         from thermal_fiducial.report.video import require_encoder
 
         require_encoder()
+
+
+def _check_picture(picture: Path, out: Path) -> None:
+    """Refuse a picture that could not be written; its folder may be that of the demo, which is made later."""
+    if not picture.parent.is_dir() and picture.parent.resolve() != out.resolve():
+        raise InputError(f'--picture {picture}: no folder {picture.parent}')
+    if picture.is_dir() or picture.suffix.lower() != '.png':
+        raise InputError(f'--picture {picture}: is not the name of a PNG file')
 
 
 def _make_room(out: Path) -> None:

@@ -10,6 +10,9 @@ from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing
 from thermal_fiducial.fabrication.plate import arrow, mounting_points, PlateOptions, text
 from thermal_fiducial.fabrication.shape import contour, Rectangle, trace
 
+#: Most circles of a board: more would be too small for any camera, and fill the memory.
+_MOST_CIRCLES = 10_000
+
 
 def asymmetric_circles(columns: int, rows: int, spacing: float) -> FloatArray:
     """Centres (rows * columns, 2) of OpenCV's asymmetric grid, row by row, x along a row and y down the rows.
@@ -29,10 +32,12 @@ def circle_board(columns: int, rows: int, spacing: float, diameter: float, optio
     Raises
     ------
     InputError
-        Circles that touch, or a grid without circles.
+        Circles that touch, or a grid of too few or too many circles.
     """
     if columns < 2 or rows < 2 or not 0.0 < diameter < spacing * np.sqrt(2.0) - 1.0:
         raise InputError('a circle grid needs 2 x 2 circles or more, and a millimetre of acrylic between them')
+    if columns * rows > _MOST_CIRCLES:
+        raise InputError(f'a circle grid of {columns} x {rows}: {_MOST_CIRCLES} circles at most')
     margin = 2.0 * spacing
     centres = asymmetric_circles(columns, rows, spacing)
     width, height = centres.max(axis=0) + 2.0 * margin

@@ -486,3 +486,10 @@ def test_lengths_of_sheets_are_no_negative_ones(tmp_path, capsys, options):
 def test_a_board_without_spacing_is_not_one_of_the_default(tmp_path, capsys):
     assert main(['markers', 'board', 'circles', '--spacing', '0', '--out', str(tmp_path / 'board')]) == 2
     assert 'a millimetre of acrylic between them' in capsys.readouterr().err
+
+
+def test_a_board_of_more_circles_than_a_camera_sees_is_refused(tmp_path, capsys):
+    out = tmp_path / 'board'
+    assert main(['markers', 'board', 'circles', '--grid', '100000', '100000', '--out', str(out)]) == 2
+    assert 'a circle grid of 100000 x 100000: 10000 circles at most' in capsys.readouterr().err
+    assert not out.exists()
