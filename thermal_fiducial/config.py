@@ -620,8 +620,8 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
 class ImuNoise(SelfChecked):
     """Continuous noise densities of the IMU, under Kalibr's names and units."""
 
-    # Upper bounds: the largest that visual-inertial odometry is run with (VINS, D2SLAM) are 0.05, 0.2, 4e-4 and 0.02,
-    # which allow for vibration; what is beyond twice that is of another unit.
+    # Upper bounds: below a thousand times the defaults, and 2, 5, 25 and 5 times the largest of a few configurations of
+    # visual-inertial odometry that were looked at (VINS, D2SLAM, OpenVINS): 0.05, 0.2, 4e-4 and 0.02.
     gyroscope_noise_density: float = param(
         1.7e-4, 'Gyroscope white noise.', unit='rad/s/sqrt(Hz)', minimum=0.0, maximum=0.1
     )
