@@ -146,8 +146,7 @@ def uncalibrated(message):
     ],
 )
 def test_nothing_but_bad_messages(replay, recording, tmp_path, topic, damage, word):
-    events = [(s, t, damage(m) if t == topic else m) for s, t, m in recording.events]
-    fails(replay(small_bag.Recording(events).write(tmp_path / 'bag')), topic, word)
+    fails(replay(recording.changed(topic, damage).write(tmp_path / 'bag')), topic, word)
 
 
 @pytest.mark.parametrize('topic', [IMAGE_TOPIC, IMU_TOPIC])
@@ -250,8 +249,7 @@ def in_g(message):
     [(other_clock, 'camera and IMU have two clocks: poses are 2.9'), (in_g, 'poses contradict gravity: the IMU says')],
 )
 def test_without_a_single_pose_the_reason_is_said(replay, recording, tmp_path, damage, words):
-    events = [(s, t, damage(m) if t == IMU_TOPIC else m) for s, t, m in recording.events]
-    status, (line,) = replay(small_bag.Recording(events).write(tmp_path / 'bag'))
+    status, (line,) = replay(recording.changed(IMU_TOPIC, damage).write(tmp_path / 'bag'))
     assert status == 0
     assert line.startswith('warning: no pose went out. ')
     assert f'pose_ekf: {words}' in line
@@ -261,8 +259,8 @@ def test_camera_info_of_another_resolution(replay, recording, tmp_path):
     def small(message):
         return small_bag.replaced(message, width=320, height=256, k=np.array([372.0, 0, 160, 0, 372, 128, 0, 0, 1]))
 
-    events = [(s, t, small(m) if t == CAMERA_INFO_TOPIC else m) for s, t, m in recording.events]
-    fails(replay(small_bag.Recording(events).write(tmp_path / 'bag')), '640x512', 'camera_info of 320x256')
+    bag = recording.changed(CAMERA_INFO_TOPIC, small).write(tmp_path / 'bag')
+    fails(replay(bag), '640x512', 'camera_info of 320x256')
 
 
 def test_a_map_in_another_frame_and_parameters_of_others_are_doubted(replay, recording, tmp_path):

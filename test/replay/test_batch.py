@@ -128,12 +128,10 @@ def test_all_arguments_that_are_no_bags_are_named_before_any_is_replayed(folder,
 
 
 def test_bags_of_different_calibrations_are_named_before_any_is_replayed(folder, capfd):
-    zoomed = small_bag.recording(seconds=0.1)
-    zoomed.events = [
-        (stamp, topic, small_bag.replaced(message, k=ZOOM * message.k) if topic == CAMERA_INFO_TOPIC else message)
-        for stamp, topic, message in zoomed.events
-    ]
-    zoomed.write(folder / 'zoomed')
+    def zoomed(message):
+        return small_bag.replaced(message, k=ZOOM * message.k)
+
+    small_bag.recording(seconds=0.1).changed(CAMERA_INFO_TOPIC, zoomed).write(folder / 'zoomed')
     assert batch(folder, 'mixed', bags=('flight0', 'zoomed', 'flight1')) == 2
     (line,) = capfd.readouterr().err.splitlines()
     assert line == 'thermal-fiducial batch: zoomed has another calibration than flight0: no joint map'
@@ -141,16 +139,8 @@ def test_bags_of_different_calibrations_are_named_before_any_is_replayed(folder,
 
 
 def test_a_bag_whose_calibration_is_none_is_named(folder, capfd):
-    recording = small_bag.recording(seconds=0.1)
-    recording.events = [
-        (
-            stamp,
-            topic,
-            small_bag.Raw('sensor_msgs/msg/CameraInfo', b'\0' * 8) if topic == CAMERA_INFO_TOPIC else message,
-        )
-        for stamp, topic, message in recording.events
-    ]
-    recording.write(folder / 'no_lens')
+    none = small_bag.Raw('sensor_msgs/msg/CameraInfo', b'\0' * 8)
+    small_bag.recording(seconds=0.1).changed(CAMERA_INFO_TOPIC, lambda _: none).write(folder / 'no_lens')
     assert batch(folder, 'lensless', bags=('no_lens',)) == 2
     assert 'no_lens: ' in capfd.readouterr().err
     assert not (folder / 'lensless').exists()

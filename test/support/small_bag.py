@@ -78,6 +78,10 @@ class Recording:
     def renamed(self, rename):
         return Recording([(stamp, rename(topic), message) for stamp, topic, message in self.events])
 
+    def changed(self, topic, change):
+        """The same with ``change`` of each message on a topic."""
+        return Recording([(stamp, name, change(m) if name == topic else m) for stamp, name, m in self.events])
+
     def compressed(self):
         """The same with its images compressed."""
         return Recording([
