@@ -233,8 +233,6 @@ def _render(flight: FlightPlan, starts: Sequence[int], pipe: Connection, parent:
             for start in starts:
                 frames = camera.frames(start, min(start + CHUNK, flight.frame_count))
                 pipe.send(list(takewhile(lambda _: os.getppid() == parent, frames)))
-        except BrokenPipeError:
-            raise
         except Exception as error:  # raised by the parent, whatever it is
             pipe.send(error)
 
