@@ -1,9 +1,11 @@
 """Steps of the camera's clock.
 
-Small ones are left to the offset in the state; its variance grows where a stamp is off the grid of frames. Of those
-that are too large for it the delay of poses changes at once. A changed delay alone does not prove a step of the clock,
-as a pipeline may stall. So a step is only proposed here, once several poses agree on it; the filter accepts it if
-restamped poses pass the gate that they fail as they came.
+A step shows in two ways. A stamp is off the grid of frames, at once, but not after a step by whole frames. And the
+delay of poses changes by the whole step, but a pipeline that stalls changes it too: a step is proposed once several
+poses agree on it.
+
+Small ones are left to the offset in the state; its variance grows before the first pose after the step. Of those that
+are too large for it the filter accepts one if restamped poses pass the gate that they fail as they came.
 
 A step of the IMU's clock looks the same, but then the stamps of the IMU have jumped by the same amount.
 """
@@ -15,9 +17,12 @@ from statistics import median
 
 from thermal_fiducial.core.measurements import CameraPose
 
-#: Smallest step [ns] that is removed: one frame period. Smaller ones are left to the estimated clock offset, as motion
-#: is nearly straight over that time.
+#: Smallest step [ns] that is removed. Smaller ones are left to the estimated clock offset, as motion is nearly straight
+#: over that time.
 SMALLEST_STEP_NS = 35_000_000
+#: Smallest change of the delay [ns] that may be a step: three quarters of a frame at 60 Hz. Smaller steps are off the
+#: grid of frames.
+_CHANGED_NS = 12_500_000
 #: Poses in a row that must agree on a step; poses kept for the usual delay, and the fewest for it to be known.
 _POSES, _USUAL, _ENOUGH = 5, 30, 15
 #: Largest spread [ns] of the delays of agreeing poses, beside half of the step.
@@ -63,14 +68,17 @@ class CameraClock:
         """``pose`` with the known steps taken out of its stamp."""
         return replace(pose, stamp_ns=pose.stamp_ns - self.ahead_ns) if self.ahead_ns else pose
 
-    def proposed(self, pose: CameraPose, newest_ns: int) -> int:
+    def proposed(self, pose: CameraPose, newest_ns: int, interval_ns: float) -> int:
         """Step of the camera's clock [ns] that the delays of the latest poses suggest, 0 for none.
 
-        ``newest_ns``: stamp of the newest IMU sample when ``pose`` arrives.
+        Parameters
+        ----------
+        newest_ns : stamp of the newest IMU sample when ``pose`` arrives
+        interval_ns : longest recent interval between samples; delays scatter by it, as they are measured by samples
         """
         late_ns = newest_ns - pose.stamp_ns
         usual_ns = median(late for _, late in self._usual) if len(self._usual) >= _ENOUGH else late_ns
-        if abs(late_ns - usual_ns) < SMALLEST_STEP_NS:
+        if abs(late_ns - usual_ns) < min(max(_CHANGED_NS, interval_ns), SMALLEST_STEP_NS):
             self._usual.append((newest_ns, late_ns))
             self._latest.clear()
             self._imu_jump_ns = 0
@@ -82,6 +90,16 @@ class CameraClock:
         if len(delays) < _POSES or max(delays) - min(delays) > min(abs(step_ns) // 2, _AGREEMENT_NS):
             return 0
         return step_ns
+
+    def take_for_usual(self) -> int:
+        """Take the delay of the latest poses for the usual one; returns the stamp of the first of them."""
+        newest_ns, late_ns = self._usual[-1]
+        # After a step back the first stamps repeat those of poses before it.
+        new = (stamp for stamp, _ in self._latest if stamp > newest_ns - late_ns)
+        first_ns = min(new, default=self._latest[-1][0])
+        self._usual.clear()
+        self._latest.clear()
+        return first_ns
 
     def follow(self, step_ns: int) -> Iterable[int]:
         """Accept a step; returns the stamps of the latest poses, which were applied at wrong instants."""

@@ -134,8 +134,11 @@ class PoseEkf:
         history, pose = self._history, self._camera_clock.stamped(pose)
         if not history.imu:
             return pose
-        step_ns = self._camera_clock.proposed(pose, history.imu.newest_ns)
+        step_ns = self._camera_clock.proposed(pose, history.imu.newest_ns, self._input.longest_ns)
         if not step_ns:
+            return pose
+        if abs(step_ns) < SMALLEST_STEP_NS:
+            self._count_with_step(abs(step_ns))
             return pose
         restamped = replace(pose, stamp_ns=pose.stamp_ns - step_ns)
         if self._camera_clock.is_of_imu(step_ns):
@@ -148,6 +151,16 @@ class PoseEkf:
         history.discard(self._camera_clock.follow(step_ns))
         self._history.take_in()
         return restamped
+
+    def _count_with_step(self, size_ns: int) -> None:
+        """Leave a step of the camera's clock to the offset: since its first pose that may be off by ``size_ns``.
+
+        Poses may be late or early by as much without a step, and may not contradict the estimate if there is one.
+        """
+        first_ns = self._camera_clock.take_for_usual()
+        if self._config.estimate_time_offset:
+            self._history.suspect_camera_step(first_ns, size_ns)
+            self._history.take_in()
 
     def _contradicts(self, pose: CameraPose) -> bool:
         """Whether poses with this stamp cannot be used: the last one was refused, or the stamp is out of range."""

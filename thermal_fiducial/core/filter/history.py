@@ -4,7 +4,7 @@ The belief after a pose depends on the samples and poses up to that instant, in 
 arrival. The exception is ``MotionAtPose``, which also averages the few samples after the pose that have arrived.
 """
 
-from bisect import bisect_right, insort
+from bisect import bisect_left, bisect_right, insort
 from collections.abc import Iterable
 import math
 from operator import attrgetter
@@ -117,6 +117,14 @@ class History:
             self._camera_steps[pose.stamp_ns] = camera_step_ns
         insort(self._poses, pose, key=_stamp)
         self._go_back_before(pose.stamp_ns)
+
+    def suspect_camera_step(self, stamp_ns: int, size_ns: int) -> None:
+        """Count with a step of the camera's clock by ``size_ns`` before the first kept pose from ``stamp_ns`` on."""
+        since = bisect_left(self._poses, stamp_ns, key=_stamp)
+        if since < len(self._poses):
+            first_ns = self._poses[since].stamp_ns
+            self._camera_steps[first_ns] = size_ns
+            self._go_back_before(first_ns)
 
     def discard(self, stamps_ns: Iterable[int]) -> None:
         """Remove poses by their stamps."""

@@ -90,7 +90,7 @@ class ImuInput:
         #: since the last sample that was used; None: no sample
         self._strays: StrayRun | None = None
         #: longest recent step [ns]
-        self._longest_ns = 0.0
+        self.longest_ns = 0.0
         #: longest step [ns] that is accepted at once, without waiting for a sample that follows
         self._usual_ns: float = min(GAP_NS, self._max_gap_ns)
         #: by how much the step to the last sample that was used exceeds the longest recent one, if by far [ns]
@@ -121,11 +121,11 @@ class ImuInput:
         assert self._last_ns is not None
         step_ns = stamp_ns - self._last_ns
         gap_ns = jump_ns or step_ns
-        unusual = gap_ns > LOST_FACTOR * self._longest_ns > 0.0
-        self.excess_ns = round(gap_ns - self._longest_ns) if unusual else 0
+        unusual = gap_ns > LOST_FACTOR * self.longest_ns > 0.0
+        self.excess_ns = round(gap_ns - self.longest_ns) if unusual else 0
         if 0 < step_ns <= self._max_gap_ns:
-            self._longest_ns = max(self._longest_ns * (1.0 - step_ns / MEMORY_NS), step_ns)
-            self._usual_ns = min(max(UNUSUAL_FACTOR * self._longest_ns, GAP_NS), self._max_gap_ns)
+            self.longest_ns = max(self.longest_ns * (1.0 - step_ns / MEMORY_NS), step_ns)
+            self._usual_ns = min(max(UNUSUAL_FACTOR * self.longest_ns, GAP_NS), self._max_gap_ns)
         self._last_ns, self._strays, self.jump_ns = stamp_ns, None, jump_ns
 
     def _stray(self, stamp_ns: int) -> Verdict:

@@ -18,9 +18,9 @@ LATE = 0.03
 FOLLOWED = AT + 1.0
 
 
-def flown(step=0.0, late=LATE):
+def flown(step=0.0, late=LATE, pose_rate=30.0):
     """The filter, its states, and the flight, in which the stamps step ahead, or poses are late, from ``AT`` on."""
-    flight = Flight(seed=3, seconds=5.0)
+    flight = Flight(seed=3, seconds=5.0, pose_rate=pose_rate)
     arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
     for pose in flight.poses:
         later = pose.stamp_ns - START_NS >= AT * 1e9
@@ -63,7 +63,7 @@ def test_poses_that_come_while_the_imu_is_silent_say_nothing_of_the_usual_delay(
         if k == silent.stop:
             clock.imu_jumped(len(silent) * frame_ns)
         newest_ns = silent.start * frame_ns if k in silent else arrival_ns
-        assert clock.proposed(pose, newest_ns) == 0
+        assert clock.proposed(pose, newest_ns, frame_ns) == 0
 
 
 def test_the_clock_offset_outlasts_a_gap_of_the_imu():
@@ -244,3 +244,42 @@ def test_a_small_step_is_learned_from_the_first_pose_on(step):
     assert off.max() < 0.03
     assert not lost[-len(off) :].any()
     assert ekf.camera_time_offset == pytest.approx(-step, abs=1.5e-3)
+
+
+@pytest.mark.parametrize('rate', [30.0, 60.0])
+@pytest.mark.parametrize('frames', [1, -1])
+def test_a_step_by_one_frame_is_learned(rate, frames):
+    """It is on the grid of frames, and poses of one marker hardly contradict the estimate."""
+    ekf, states, lost, flight = flown(frames / rate, pose_rate=rate)
+    off, _ = errors(flight, states, AT)
+    # As good as before the step: one marker at 2 m. If the step is not suspected 5 to 20 cm.
+    assert off.max() < 0.03
+    # Poses do not contradict for longer than five of them take, which show the step.
+    assert lost[-len(off) :].sum() < 5 / rate * 200.0
+    assert ekf.resets == 0
+    assert ekf.camera_time_offset == pytest.approx(-frames / rate, abs=1.5e-3)
+
+
+@pytest.mark.parametrize('later', [1 / 30.0, -0.02])
+def test_poses_that_are_later_or_earlier_by_a_frame_are_no_step(later):
+    ekf, states, lost, flight = flown(late=LATE + later)
+    off, _ = errors(flight, states, AT)
+    # as good as without
+    assert off.max() < 0.03
+    assert not lost[-len(off) :].any()
+    assert ekf.camera_time_offset == pytest.approx(0.0, abs=1.5e-3)
+
+
+def proposed_steps(interval_ns, changed_ns):
+    """Steps that poses at 30 Hz propose, by an IMU of these intervals, whose delay changes after two seconds."""
+    clock, found = CameraClock(), []
+    for k in range(120):
+        pose = CameraPose(k * FRAME_NS, np.eye(4), np.eye(6))
+        arrival_ns = pose.stamp_ns + 40_000_000 + changed_ns * (k >= 60)
+        found.append(clock.proposed(pose, arrival_ns // interval_ns * interval_ns, interval_ns))
+    return [step for step in found if step]
+
+
+def test_a_changed_delay_is_known_to_the_interval_of_the_imu():
+    assert proposed_steps(5_000_000, -20_000_000)[0] == pytest.approx(20_000_000, abs=5_000_000)
+    assert not proposed_steps(25_000_000, -20_000_000)
