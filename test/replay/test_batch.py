@@ -12,8 +12,9 @@ from support import small_bag
 from support.interrupts import interrupted
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.replay import many_bags
 
 pytest.importorskip('distributed', reason='the extra "batch" is not installed')
 pytestmark = [
@@ -60,6 +61,21 @@ def test_runs_and_a_joint_map(alone):
     assert sorted(load_map(alone / 'marker_map.yaml').markers) == [0, 1, 2, 3]
     assert {path.name for path in alone.iterdir()} == {'flight0', 'flight1', 'marker_map.yaml', 'batch.json'}
     assert (alone / 'flight1' / 'fused.tum').read_text()
+
+
+def test_the_calibration_of_a_bag_is_read_once(folder, monkeypatch):
+    read = []
+
+    class Noted(BagReader):
+        """Notes from where messages of which topics are read."""
+
+        def messages(self, topics=None):
+            read.append((self.path.name, topics))
+            return super().messages(topics)
+
+    monkeypatch.setattr(many_bags, 'BagReader', Noted)
+    assert batch(folder, 'once') == 0
+    assert [name for name, topics in read if topics == [CAMERA_INFO_TOPIC]] == ['flight0', 'flight1']
 
 
 def test_two_workers_of_which_one_is_killed_write_the_same_bytes(folder, alone):

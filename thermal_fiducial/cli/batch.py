@@ -57,13 +57,17 @@ def run(args: argparse.Namespace) -> int:
         remaps=parse_remaps(args.remap),
     )
     batch = Batch(tuple(args.bags), args.out, options, args.max_frames)
-    batch.check()
+    camera = batch.check()
     count = min(args.workers, len(args.bags))
     with batch.cleared_up(), workers(count, args.scheduler) as client, progress_bar('batch') as progress:
-        summary = run_batch(batch, client, progress, lambda line: print(f'warning: {line}', file=sys.stderr))
+        summary = run_batch(batch, camera, client, progress, _warn)
     runs = '1 run' if len(summary['runs']) == 1 else f'{len(summary["runs"])} runs'
     print(
         f'{args.out}: {runs}; {len(summary["markers"])} markers in the joint map, '
         f'{summary["frames_used"]} of {summary["frames"]} frames used'
     )
     return 0
+
+
+def _warn(line: str) -> None:
+    print(f'warning: {line}', file=sys.stderr)

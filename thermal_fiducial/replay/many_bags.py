@@ -79,8 +79,14 @@ class Batch:
             for bag, name in zip(self.bags, names, strict=True)
         ]
 
-    def check(self) -> None:
-        """Raise InputError for unusable input before any workers are started."""
+    def check(self) -> Camera:
+        """The camera of all bags, before any workers are started.
+
+        Raises
+        ------
+        InputError
+            Unusable input.
+        """
         runs = self.runs()
         missing = [str(bag) for bag in self.bags if not bag.exists()]
         if missing:
@@ -91,7 +97,7 @@ class Batch:
         if (self.out / MAP_FILE).exists() and not (self.out / SUMMARY_FILE).exists():
             raise InputError(f'{self.out / MAP_FILE} is not of an earlier batch: choose another folder with --out')
         self._check_bags(runs)
-        _common_camera(runs, read_settings(self.options.params, {}))
+        return _common_camera(runs, read_settings(self.options.params, {}))
 
     @contextmanager
     def cleared_up(self) -> Iterator[None]:
@@ -169,13 +175,14 @@ def _blocked_in_children() -> Iterator[None]:
 
 
 def run_batch(
-    batch: Batch, client: Any, progress: Callable[[float], None], warn: Callable[[str], None]
+    batch: Batch, camera: Camera, client: Any, progress: Callable[[float], None], warn: Callable[[str], None]
 ) -> dict[str, Any]:
     """Replay all bags on the workers of ``client``, then adjust one map to all detections.
 
     Parameters
     ----------
     batch : bags and options; the paths must be valid on the workers
+    camera : that of all bags, from :meth:`Batch.check`
     client : of Dask distributed
     progress : called with the share done, 0 to 1
     warn : called with warnings
@@ -192,12 +199,11 @@ def run_batch(
         Repeated deaths of workers on the same bag.
     """
     runs = batch.runs()
-    settings = read_settings(batch.options.params, {})
     if batch.options.map_file is None:
         raise InputError('a joint map needs --map with at least one marker of known pose')
     _prepare_folder(batch.out)
     _replay_all(runs, client, progress, warn)
-    built, frames = _joint_map(batch, runs, settings)
+    built, frames = _joint_map(batch, runs, camera)
     save_map(batch.out / MAP_FILE, built.map)
     summary = _summary_of(built) | {'runs': [run.run.name for run in runs], 'frames': frames}
     write_text(batch.out / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
@@ -273,10 +279,9 @@ def replay_whole(options: Options) -> list[str]:
     return warnings
 
 
-def _joint_map(batch: Batch, runs: Sequence[Options], settings: Settings) -> tuple[Built, int]:
-    config = replace(settings.marker_mapper, mode='mapping')
+def _joint_map(batch: Batch, runs: Sequence[Options], camera: Camera) -> tuple[Built, int]:
+    config = replace(read_settings(batch.options.params, {}).marker_mapper, mode='mapping')
     start = load_map(Path(str(batch.options.map_file)), config.marker_size)
-    camera = _common_camera(runs, settings)
     share = max(batch.max_frames // len(runs), 1)
     frames = [rows for run in runs for rows in _frames(run, share)]
     if not frames:
