@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from support import small_bag
 from support.interrupts import interrupted
+from support.tasks import write_twice
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.replay import many_bags
+from thermal_fiducial.replay.workers import workers
 
 pytest.importorskip('distributed', reason='the extra "batch" is not installed')
 pytestmark = [
@@ -203,6 +205,67 @@ def longer(folder):
     for seed, bag in enumerate(bags):
         small_bag.recording(seconds=10.0, seed=seed).write(bag)
     return bags
+
+
+def interrupted_in_a_bag(begun, ended):
+    """A batch that is interrupted as soon as its worker has begun."""
+    with workers(1) as client:
+        client.submit(write_twice, begun, ended)
+        while not begun.exists():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+
+
+def test_workers_end_in_the_middle_of_a_bag_when_the_batch_is_interrupted(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_in_a_bag(tmp_path / 'begun', tmp_path / 'ended')
+    assert not (tmp_path / 'ended').exists()
+
+
+class Killed(BaseException):
+    """In place of the signal of which no process knows."""
+
+
+def killed_at(step, monkeypatch):
+    """Let a process be killed at one of its renames and removals, of which it does no further ones."""
+    steps = []
+
+    def happens():
+        steps.append(None)
+        if len(steps) >= step:
+            raise Killed
+
+    def rename(path, target, rename=Path.rename):
+        happens()
+        return rename(path, target)
+
+    def half_removed(path, ignore_errors):
+        if len(steps) < step:
+            next(file for file in path.rglob('*') if file.is_file()).unlink()
+        happens()
+
+    monkeypatch.setattr(Path, 'rename', rename)
+    monkeypatch.setattr(many_bags.shutil, 'rmtree', half_removed)
+
+
+@pytest.mark.parametrize(('step', 'left'), [(1, 'old'), (2, 'old'), (3, 'new')])
+def test_a_worker_that_is_killed_while_it_replaces_a_run_leaves_one_whole(tmp_path, monkeypatch, step, left):
+    def write(options, progress, warn):
+        options.run.mkdir()
+        (options.run / 'new').touch()
+
+    run = tmp_path / 'out' / 'flight'
+    run.mkdir(parents=True)
+    (run / 'old').touch()
+    options = many_bags.Options(bag=Path('flight'), run=run)
+    with monkeypatch.context() as patched:
+        patched.setattr(many_bags, 'replay', write)
+        killed_at(step, patched)
+        with pytest.raises(Killed):
+            many_bags.replay_whole(options)
+    with many_bags.Batch((options.bag,), run.parent, options).cleared_up():
+        pass
+    assert list(contents(tmp_path)) == [Path('out/flight') / left]
 
 
 @pytest.mark.nightly

@@ -28,3 +28,10 @@ def _wait_for(path):
         if time.monotonic() > until:
             raise ValueError('waited in vain')
         time.sleep(0.005)
+
+
+def write_twice(begun, ended):
+    """Write a file, and another one a second later, which a process that is ended in between does not."""
+    begun.touch()
+    time.sleep(1.0)
+    ended.touch()

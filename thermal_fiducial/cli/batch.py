@@ -45,8 +45,9 @@ def run(args: argparse.Namespace) -> int:
         import distributed  # noqa: F401
     except ImportError:
         raise InputError("needs the extra 'batch': pip install '.[batch]' in the package's folder") from None
-    from thermal_fiducial.replay.many_bags import Batch, run_batch, workers
+    from thermal_fiducial.replay.many_bags import Batch, run_batch
     from thermal_fiducial.replay.session import Options
+    from thermal_fiducial.replay.workers import workers
 
     options = Options(
         bag=args.bags[0],

@@ -5,14 +5,11 @@ of its bag. Run folders appear atomically.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, ExitStack, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 import json
-import logging
-from multiprocessing import resource_tracker
 from pathlib import Path
 import shutil
-import signal
 import tempfile
 from typing import Any
 
@@ -32,17 +29,9 @@ from thermal_fiducial.replay.earlier_runs import refuse_other_folder
 from thermal_fiducial.replay.session import check, MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.ros.messages import clouds, convert, message_bytes
-from thermal_fiducial.ros.process.interrupts import Interrupts
 
 #: Written last; it and the map of an earlier batch are deleted before the first replay.
 SUMMARY_FILE = 'batch.json'
-#: Settings of a local cluster: how many workers may die with a bag before the bag is to blame; and no timeout of a
-#: starved worker, since a dead one shows by its connection.
-_PATIENT = {
-    'distributed.scheduler.allowed-failures': 10,
-    'distributed.scheduler.worker-ttl': None,
-    'distributed.comm.timeouts.connect': '600s',
-}
 
 
 @dataclass(frozen=True)
@@ -107,6 +96,7 @@ class Batch:
         finally:
             for run in self.runs():
                 for unfinished in run.run.parent.glob(f'.{run.run.name}-*'):
+                    _put_back(unfinished, run.run)
                     shutil.rmtree(unfinished, ignore_errors=True)
             # Empty if no bag was replayed.
             with suppress(OSError):
@@ -122,56 +112,6 @@ class Batch:
                 reasons[str(error)] = None
         if reasons:
             raise InputError('; '.join(reasons))
-
-
-@contextmanager
-def workers(count: int, scheduler: str = '') -> Iterator[Any]:
-    """A client of ``count`` worker processes of this machine, or of the cluster at address ``scheduler``.
-
-    Raises
-    ------
-    InputError
-        No cluster answers there.
-    """
-    import dask
-    from distributed import Client, LocalCluster
-
-    if scheduler:
-        try:
-            client = Client(scheduler)
-        except (OSError, ValueError) as error:
-            raise InputError(f'no scheduler at {scheduler}: {error}') from None
-        with client:
-            yield client
-        return
-    with dask.config.set(_PATIENT), ExitStack() as ending:
-        # Half a cluster ends with tracebacks of its own.
-        with Interrupts(held=True), _blocked_in_children():
-            cluster = LocalCluster(
-                n_workers=count,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address=':0',
-                silence_logs=logging.CRITICAL,
-            )
-            ending.enter_context(cluster)
-            client = ending.enter_context(Client(cluster))
-        yield client
-
-
-@contextmanager
-def _blocked_in_children() -> Iterator[None]:
-    """Let processes that are started meanwhile, and those that threads of theirs start later, never get SIGINT.
-
-    Ctrl-C reaches all processes of a terminal; only the first of them is to act on it.
-    """
-    # Python's helper of spawned processes, started here if there is none yet, would unblock it.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def run_batch(
@@ -272,11 +212,25 @@ def replay_whole(options: Options) -> list[str]:
         folder = Path(tempfile.mkdtemp(prefix=f'.{options.run.name}-', dir=options.run.parent))
         try:
             replay(replace(options, run=folder / options.run.name), lambda share: None, warnings.append)
-            shutil.rmtree(options.run, ignore_errors=True)
+            # A worker that is killed while it deletes files of an earlier run must not leave the rest of them.
+            if options.run.exists():
+                options.run.rename(_moved_aside(options.run, folder))
             (folder / options.run.name).rename(options.run)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
     return warnings
+
+
+def _moved_aside(run: Path, folder: Path) -> Path:
+    """Where a run is from when it is replaced until it is deleted; ``folder``: that of the new one."""
+    return folder / f'{run.name}.earlier'
+
+
+def _put_back(unfinished: Path, run: Path) -> None:
+    """Put an earlier run back from the folder of a worker that was killed between the two renames."""
+    with suppress(OSError):
+        # Fails where a run is in its place.
+        _moved_aside(run, unfinished).rename(run)
 
 
 def _joint_map(batch: Batch, runs: Sequence[Options], camera: Camera) -> tuple[Built, int]:
