@@ -1,8 +1,9 @@
 """The flights of all faults and seeds, in processes of their own."""
 
+from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import as_completed, ProcessPoolExecutor
-import multiprocessing
+
+from support.jobs import Died, outcomes
 
 from faults import picture_faults
 from faults.camera_faults import lone_map
@@ -21,10 +22,15 @@ def score_of(index: int, seed: int) -> Score:
 
 
 def scores(chosen: Sequence[int], seeds: int, workers: int) -> Iterator[tuple[int, Score]]:
-    """Scores as they are done, each with the number of its fault; a seed's flights follow each other."""
-    jobs = [(index, seed) for seed in range(seeds) for index in chosen]
-    context = multiprocessing.get_context('spawn')
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        futures = {pool.submit(score_of, *job): job[0] for job in jobs}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
+    """Scores as they are done, each with the number of its fault; a seed's flights follow each other.
+
+    Raises
+    ------
+    RuntimeError
+        The process of a flight was killed.
+    """
+    jobs = deque((index, seed) for seed in range(seeds) for index in chosen)
+    for (index, seed), result in outcomes(score_of, jobs, workers):
+        if isinstance(result, Died):
+            raise RuntimeError(f'the process of seed {seed} with the fault "{FAULTS[index].name}" was killed')
+        yield index, result

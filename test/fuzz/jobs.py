@@ -1,11 +1,10 @@
 """Inputs in processes of their own, so that one that ends its process is found, named, and the rest goes on."""
 
+from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import as_completed, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from itertools import islice
-import multiprocessing
 from pathlib import Path
+
+from support.jobs import Died, outcomes
 
 from fuzz import files, messages
 from fuzz.findings import Finding
@@ -26,7 +25,7 @@ def batch(target: str, numbers: range, note: str) -> list[Finding]:
 
 
 def _noted(note: str, text: str) -> None:
-    # Whole at any instant: a process ends when another beside it has died.
+    # Whole at any instant: a process may be killed while it writes.
     Path(f'{note}.new').write_text(text)
     Path(f'{note}.new').replace(note)
 
@@ -39,34 +38,24 @@ def batches(target: str, first: int, count: int) -> list[tuple[str, range]]:
 
 def findings(jobs: list[tuple[str, range]], workers: int, folder: Path) -> Iterator[tuple[int, list[Finding]]]:
     """How many inputs are done, and what was found, batch after batch."""
-    context = multiprocessing.get_context('spawn')
-    waiting = dict(enumerate(jobs))
-    while waiting:
-        # A process that dies takes its pool along: what was not done is done in a new one. None works for long, as what
-        # one batch leaves behind must not become the next one's; max_tasks_per_child of Python 3.11 hangs for that.
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
-            running = {
-                pool.submit(batch, target, numbers, str(folder / f'{key}.txt')): key
-                for key, (target, numbers) in islice(waiting.items(), workers * BATCHES)
-            }
-            try:
-                for future in as_completed(running):
-                    found = future.result()
-                    _, numbers = waiting.pop(running[future])
-                    yield len(numbers), found
-                continue
-            except BrokenProcessPool:
-                dead = [key for key in waiting if (folder / f'{key}.txt').exists()]
-        for key in dead:
-            yield from _after_a_death(waiting, key, folder / f'{key}.txt')
+    waiting = deque((target, numbers, str(folder / f'{key}.txt')) for key, (target, numbers) in enumerate(jobs))
+    # No process works for long, as what one batch leaves behind must not become the next one's.
+    for (target, numbers, note), found in outcomes(batch, waiting, workers, BATCHES):
+        if not isinstance(found, Died):
+            yield len(numbers), found
+            continue
+        number = _last(note, numbers)
+        rest = range(number + 1, numbers.stop)
+        if rest:
+            waiting.append((target, rest, note))
+        yield number + 1 - numbers.start, [Finding(target, number, 'died', 'the process ended')]
 
 
-def _after_a_death(waiting: dict[int, tuple[str, range]], key: int, note: Path) -> Iterator[tuple[int, list[Finding]]]:
-    """The input of a batch that was being tried is blamed where the process died with it; the batch goes on behind."""
-    target, numbers = waiting.pop(key)
-    number = int(note.read_text().split()[1])
-    note.unlink()
-    rest = range(number + 1, numbers.stop)
-    if rest:
-        waiting[key] = target, rest
-    yield number + 1 - numbers.start, [Finding(target, number, 'died', 'the process ended, or another one beside it')]
+def _last(note: str, numbers: range) -> int:
+    """The input that was being tried when a process died: the first of the batch if it had not begun any."""
+    try:
+        number = int(Path(note).read_text().split()[1])
+    except FileNotFoundError:
+        return numbers.start
+    # A note of an earlier process is about an input before the batch.
+    return max(number, numbers.start)

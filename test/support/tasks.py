@@ -35,3 +35,8 @@ def write_twice(begun, ended):
     begun.touch()
     time.sleep(1.0)
     ended.touch()
+
+
+def large(megabytes):
+    """Bytes that fill any pipe."""
+    return bytes(megabytes * 1_000_000)
