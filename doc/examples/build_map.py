@@ -27,4 +27,6 @@ def main(bag: str, parameters: str, start: str, out: str) -> None:
 
 
 if __name__ == '__main__':
+    if len(sys.argv) != 5:
+        sys.exit('usage: python build_map.py BAG PARAMETERS START.yaml OUT.yaml')
     main(*sys.argv[1:])

@@ -25,4 +25,6 @@ def main(picture: str, calibration: str) -> None:
 
 
 if __name__ == '__main__':
+    if len(sys.argv) != 3:
+        sys.exit('usage: python detect_in_picture.py PICTURE CALIBRATION')
     main(*sys.argv[1:])

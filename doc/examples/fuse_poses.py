@@ -35,4 +35,6 @@ def main(bag: str, poses: str, out: str) -> None:
 
 
 if __name__ == '__main__':
+    if len(sys.argv) != 4:
+        sys.exit('usage: python fuse_poses.py BAG POSES.tum OUT.tum')
     main(*sys.argv[1:])

@@ -27,4 +27,6 @@ def main(bag: str, parameters: str, marker_map: str, out: str) -> None:
 
 
 if __name__ == '__main__':
+    if len(sys.argv) != 5:
+        sys.exit('usage: python localize_bag.py BAG PARAMETERS MAP OUT.tum')
     main(*sys.argv[1:])

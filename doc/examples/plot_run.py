@@ -27,4 +27,6 @@ def main(run: str, out: str) -> None:
 
 
 if __name__ == '__main__':
+    if len(sys.argv) != 3:
+        sys.exit('usage: python plot_run.py RUN OUT.png')
     main(*sys.argv[1:])

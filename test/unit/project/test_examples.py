@@ -1,7 +1,9 @@
 """The scripts of ``doc/examples`` do what they say."""
 
 from pathlib import Path
+import re
 import runpy
+import sys
 
 import cv2
 import numpy as np
@@ -50,6 +52,17 @@ def test_there_are_five_of_at_most_40_lines():
 def test_each_is_in_the_document():
     text = (FOLDER.parent / 'examples.md').read_text()
     assert all(f'examples/{script}.py' in text for script in SCRIPTS)
+
+
+@pytest.mark.parametrize('script', SCRIPTS)
+@pytest.mark.parametrize('words', [[], ['one', 'two', 'three', 'four', 'five']])
+def test_wrong_arguments_are_answered_by_one_line_that_names_them_all(monkeypatch, script, words):
+    path = FOLDER / f'{script}.py'
+    (usage,) = re.findall(r'^""".*``(python .*?)``', path.read_text())
+    monkeypatch.setattr(sys, 'argv', [str(path), *words])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(path), run_name='__main__')
+    assert ended.value.code == f'usage: {usage}'
 
 
 def test_detect_in_picture(tmp_path, capsys):
