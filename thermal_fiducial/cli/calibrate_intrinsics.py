@@ -14,6 +14,7 @@ from thermal_fiducial.calibration.report import BoardView, write_report
 from thermal_fiducial.calibration.sources import is_folder_of_pictures, measured_points
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
 from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures
+from thermal_fiducial.cli.ranges import BOARD_MM, BOARD_POINTS, FOCAL_PX, IMAGE_PX, MORE_POINTS
 from thermal_fiducial.cli.subcommands import add_remap, file_to_write, whole_number
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
@@ -48,11 +49,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--models', default=','.join(CANDIDATES), metavar='NAMES', help='models to choose among, by held-out error'
     )
-    parser.add_argument('--focal-px', type=float, default=600.0, help='rough focal length to start from [px]')
+    parser.add_argument('--focal-px', type=FOCAL_PX, default=600.0, help='rough focal length to start from [px]')
     parser.add_argument('--most-views', type=whole_number(1), default=80, help='stop looking for views after this many')
-    parser.add_argument('--every', type=int, default=5, help='look at every n-th frame of a bag')
+    parser.add_argument('--every', type=whole_number(1), default=5, help='look at every n-th frame of a bag')
     parser.add_argument(
-        '--size', type=int, nargs=2, metavar=('WIDTH', 'HEIGHT'), help='size of the image, needed with a CSV file'
+        '--size', type=IMAGE_PX, nargs=2, metavar=('WIDTH', 'HEIGHT'), help='size of the image, needed with a CSV file'
     )
     add_remap(parser)
     _add_board(parser.add_argument_group('board'))
@@ -64,14 +65,14 @@ def _add_board(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         '--grid',
-        type=int,
+        type=BOARD_POINTS,
         nargs=2,
         metavar=('COLUMNS', 'ROWS'),
         help='inner corners, or circles as OpenCV counts them (default: 8 6; circles 4 11; symmetric-circles 7 5)',
     )
     group.add_argument(
         '--longer-rows',
-        type=int,
+        type=MORE_POINTS,
         default=0,
         metavar='N',
         help='number of circles by which every other row is longer than COLUMNS',
@@ -85,19 +86,19 @@ def _add_board(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument(
         '--spacing',
-        type=float,
+        type=BOARD_MM,
         metavar='MM',
         help='side of a square, or distance between two rows of circles (default: 50; circles 25)',
     )
-    group.add_argument('--diameter', type=float, default=20.0, metavar='MM', help='diameter of the circles')
+    group.add_argument('--diameter', type=BOARD_MM, default=20.0, metavar='MM', help='diameter of the circles')
     group.add_argument('--board', type=Path, metavar='MAP', help='marker map of a marker board')
 
 
 def _intrinsics(args: argparse.Namespace) -> int:
     models = args.models.split(',')
     unknown = set(models) - set(CANDIDATES)
-    if unknown or not args.focal_px > 0.0 or args.every < 1:
-        raise InputError(f'--models are {", ".join(CANDIDATES)}; --focal-px and --every must be positive')
+    if unknown:
+        raise InputError(f'--models are {", ".join(CANDIDATES)}, not {", ".join(sorted(unknown))}')
     views = _views(args)
     views.require(args.source)
     with naming(args.source):
@@ -117,7 +118,7 @@ def _intrinsics(args: argparse.Namespace) -> int:
 
 def _views(args: argparse.Namespace) -> BoardViews:
     if args.source.suffix.lower() == '.csv':
-        if args.size is None or min(args.size) < 32:
+        if args.size is None:
             raise InputError(f'{args.source}: points without pictures need --size WIDTH HEIGHT')
         named = [BoardView(name, sighting) for name, sighting in measured_points(args.source, *args.size)]
         return BoardViews(None, named, size=tuple(args.size))

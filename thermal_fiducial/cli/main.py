@@ -6,12 +6,13 @@ import errno
 from importlib import import_module
 from io import TextIOWrapper
 import os
+from pathlib import Path
 import signal
 import sys
 from typing import Any, NoReturn
 
 from thermal_fiducial import __version__
-from thermal_fiducial.cli.subcommands import add_command
+from thermal_fiducial.cli.subcommands import add_command, any_path
 from thermal_fiducial.errors import InputError, RunError
 from thermal_fiducial.files.reading import shown
 from thermal_fiducial.ros.process.interrupts import Interrupts
@@ -72,6 +73,7 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{'formatter_class': _Help, **options})
+        self.register('type', Path, any_path)
 
     def parse_known_args(self, *given: Any, **options: Any) -> Any:
         """Name arguments that a command does not have with its own usage; argparse does with that of the program."""
@@ -121,7 +123,7 @@ def _finished(argv: Sequence[str], interrupts: Interrupts) -> int:
         if found is None:
             raise
         status, words = found
-        print(f'{PROGRAM} {argv[0] if argv else ""}: {words}', file=sys.stderr)
+        print(f'{PROGRAM} {argv[0] if argv else ""}: {_on_one_line(words)}', file=sys.stderr)
         return status
 
 
@@ -155,6 +157,11 @@ def _reported(error: BaseException) -> tuple[int, str] | None:
         _discard_output()
         return 2, f'{shown(error.filename or "output")}: {error.strerror}'
     return None
+
+
+def _on_one_line(words: str) -> str:
+    """A message with what was given, whose letters may be any, without the unprintable ones."""
+    return ''.join(letter if letter.isprintable() else '?' for letter in words)
 
 
 def _allow_any_letter() -> None:

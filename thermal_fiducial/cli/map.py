@@ -10,6 +10,7 @@ import numpy as np
 
 from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
 from thermal_fiducial.cli.marker_sizes import add_sizes, join_sizes
+from thermal_fiducial.cli.ranges import SIGMA_DEG, SIGMA_M
 from thermal_fiducial.cli.subcommands import add_command, Commands, file_to_write
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
@@ -88,9 +89,9 @@ def _add_editing(commands: Commands) -> None:
         '--position', type=float, nargs=3, required=True, metavar=('X', 'Y', 'Z'), help='position of its centre [m]'
     )
     move.add_argument('--orientation', type=float, nargs=4, metavar=('QX', 'QY', 'QZ', 'QW'), help='default: as it is')
-    move.add_argument('--sigma', type=float, default=0.005, metavar='M', help='standard deviation of the position')
+    move.add_argument('--sigma', type=SIGMA_M, default=0.005, metavar='M', help='standard deviation of the position')
     move.add_argument(
-        '--sigma-deg', type=float, default=1.0, metavar='DEG', help='standard deviation of the orientation'
+        '--sigma-deg', type=SIGMA_DEG, default=1.0, metavar='DEG', help='standard deviation of the orientation'
     )
     rename = _command(commands, 'rename', 'give a marker another ID', _rename)
     rename.add_argument('old', type=int, metavar='OLD', help='ID that it has')
@@ -178,9 +179,6 @@ def _move(args: argparse.Namespace) -> int:
         raise InputError('--position is not three finite numbers')
     if args.orientation and not 0.9 < float(np.linalg.norm(args.orientation)) < 1.1:
         raise InputError('--orientation is no unit quaternion x y z w')
-    for name, sigma in (('--sigma', args.sigma), ('--sigma-deg', args.sigma_deg)):
-        if not 0.0 <= sigma < np.inf:
-            raise InputError(f'{name} {sigma:g} is no standard deviation')
     covariance = np.diag([args.sigma**2 / 3.0] * 3 + [np.deg2rad(args.sigma_deg) ** 2 / 3.0] * 3)
     return _edit(args, f'move {args.id}', lambda marker_map: _moved(args, marker_map, covariance))
 

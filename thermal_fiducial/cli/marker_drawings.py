@@ -10,7 +10,7 @@ import numpy as np
 
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.subcommands import number
+from thermal_fiducial.cli.ranges import LENGTH_MM
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
@@ -40,10 +40,6 @@ _OPTION_HELP = {
 }
 
 
-#: Type of a length of a sheet or between cuts [mm]: the widest sheets of acrylic are 2 to 3 m.
-_LENGTH = number(0.0, 10_000.0, 'mm')
-
-
 def add_make(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``markers make``."""
     parser.set_defaults(do=_make)
@@ -66,10 +62,10 @@ def add_sheet(parser: argparse.ArgumentParser) -> None:
     add_choice(parser)
     add_plate_options(parser)
     parser.add_argument(
-        '--sheet', type=_LENGTH, nargs=2, default=(1000.0, 600.0), metavar=('WIDTH', 'HEIGHT'), help='its size [mm]'
+        '--sheet', type=LENGTH_MM, nargs=2, default=(1000.0, 600.0), metavar=('WIDTH', 'HEIGHT'), help='its size [mm]'
     )
-    parser.add_argument('--spacing', type=_LENGTH, default=5.0, metavar='MM', help='between markers')
-    parser.add_argument('--margin', type=_LENGTH, default=10.0, metavar='MM', help='along the border of the sheet')
+    parser.add_argument('--spacing', type=LENGTH_MM, default=5.0, metavar='MM', help='between markers')
+    parser.add_argument('--margin', type=LENGTH_MM, default=10.0, metavar='MM', help='along the border of the sheet')
     _add_output(parser)
 
 
@@ -95,9 +91,9 @@ def add_board(parser: argparse.ArgumentParser) -> None:
         '--grid', type=int, nargs=2, metavar=('COLUMNS', 'ROWS'), help='default: 4 11 circles, 4 3 markers'
     )
     parser.add_argument(
-        '--spacing', type=_LENGTH, metavar='MM', help='default: 25 between rows of circles, 40 between markers'
+        '--spacing', type=LENGTH_MM, metavar='MM', help='default: 25 between rows of circles, 40 between markers'
     )
-    parser.add_argument('--diameter', type=_LENGTH, default=20.0, metavar='MM', help='of the circles')
+    parser.add_argument('--diameter', type=LENGTH_MM, default=20.0, metavar='MM', help='of the circles')
     parser.add_argument('--dictionary', default='STENCIL_4X4_100', help='of the markers')
     add_plate_options(parser, size=130.0)
     _add_output(parser)
@@ -151,7 +147,7 @@ def add_plate_options(parser: argparse.ArgumentParser, size: float = PlateOption
         '--quiet-cells', type=float, default=1.0, metavar='CELLS', help='width of the warm ring around the pattern'
     )
     group.add_argument(
-        '--min-web', type=_LENGTH, default=3.0, metavar='MM', help='least width of acrylic between holes'
+        '--min-web', type=LENGTH_MM, default=3.0, metavar='MM', help='least width of acrylic between holes'
     )
 
 

@@ -8,7 +8,18 @@ from rich.table import Table
 
 from thermal_fiducial.cli.marker_drawings import add_force, refuse_to_overwrite
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.subcommands import file_to_write, whole_number
+from thermal_fiducial.cli.ranges import (
+    AFTER_S,
+    BITS,
+    CONTRAST_K,
+    DISTANCE_M,
+    FOG_PER_M,
+    GAP_MM,
+    LENS_MM,
+    LOSS,
+    NETD_K,
+)
+from thermal_fiducial.cli.subcommands import file_to_write, number, whole_number
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
@@ -28,8 +39,8 @@ from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.packages import require_plots
 from thermal_fiducial.files.writing import new_file
 
-# Pitch of a Tau 2's pixels, and shortest focal length, of which a smaller number is probably in metres [mm].
-_PITCH_MM, _SHORTEST_MM = 0.017, 0.5
+# Pitch of a Tau 2's pixels.
+_PITCH_MM = 0.017
 _FADE_SECONDS = (0.0, 30.0, 60.0, 120.0, 300.0, 900.0, 3600.0)
 _STAND_OFFS_MM = (0.0, 0.5, 2.0, 5.0, 10.0, 20.0)
 # Narrowest sides [px] from the detector's min_side_px to a marker that fills the image, and one on each side of where
@@ -45,31 +56,39 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
     camera = parser.add_argument_group('camera')
     camera.add_argument('--calibration', type=Path, help='camera_info YAML (default: the --lens of a Tau 2)')
     camera.add_argument('--lens', type=float, default=13.0, metavar='MM', help='focal length, without a calibration')
-    camera.add_argument('--netd', type=float, default=0.05, metavar='K', help='temporal noise of the camera')
+    camera.add_argument('--netd', type=NETD_K, default=0.05, metavar='K', help='temporal noise of the camera')
     marker = parser.add_argument_group('marker')
     marker.add_argument('--size', type=float, default=300.0, metavar='MM', help='side of the black square')
-    marker.add_argument('--bits', type=whole_number(3), default=4, help='bits along a side of the dictionary')
+    marker.add_argument('--bits', type=BITS, default=4, help='bits along a side of the dictionary')
     marker.add_argument('--thickness', type=float, default=3.0, metavar='MM', help='thickness of the acrylic')
     marker.add_argument(
-        '--stand-off', type=float, default=10.0, metavar='MM', help='air gap between warm surface and sheet'
+        '--stand-off', type=GAP_MM, default=10.0, metavar='MM', help='air gap between warm surface and sheet'
     )
     scene = parser.add_argument_group('scene')
     scene.add_argument(
         '--contrast',
-        type=float,
+        type=number(*CONTRAST_K, 'K'),
         default=15.0,
         metavar='K',
         help='temperature of the warm surface above that of the room',
     )
-    scene.add_argument('--after', type=float, default=300.0, metavar='S', help='time since the surface was switched on')
+    scene.add_argument(
+        '--after', type=AFTER_S, default=300.0, metavar='S', help='time since the surface was switched on'
+    )
     scene.add_argument(
         '--loss',
-        type=float,
+        type=LOSS,
         default=10.0,
         metavar='W/m2/K',
         help='heat transfer to the room: 10 in still air, 25 under rotors',
     )
-    scene.add_argument('--fog', type=float, default=0.0, metavar='1/M', help='extinction in the long-wave infrared')
+    scene.add_argument(
+        '--fog',
+        type=number(*FOG_PER_M, '1/m'),
+        default=0.0,
+        metavar='1/M',
+        help='extinction in the long-wave infrared',
+    )
     scene.add_argument('--tilt', type=float, default=30.0, metavar='DEG', help='angle between normal and line of sight')
     scene.add_argument('--distances', default='1,1.5,2,3,4,6,8,12', metavar='LIST', help='distances [m]')
     parser.add_argument('--plot', type=file_to_write, metavar='FILE', help='picture of both tables (PNG, PDF, SVG)')
@@ -82,9 +101,9 @@ def _plan(args: argparse.Namespace) -> int:
     if args.plot is not None:
         require_plots()
     distances = _numbers(args.distances)
-    mounting = Mounting(1e-3 * args.thickness, 1e-3 * args.stand_off, args.loss)
     # The same sizes as are drawn.
     PlateOptions(size=args.size, thickness=args.thickness)
+    mounting = Mounting(1e-3 * args.thickness, 1e-3 * args.stand_off, args.loss)
     share = float(remaining_contrast(mounting, args.after))
     contrast = args.contrast * share
     measurements = load_measurements(args.tables)
@@ -106,24 +125,25 @@ def _numbers(text: str) -> list[float]:
         values = [float(part) for part in text.split(',')]
     except ValueError:
         raise InputError(f'--distances {text!r} is not a list of numbers') from None
-    if min(values) <= 0.0:
-        raise InputError(f'--distances {text!r}: all must be positive')
+    least, most = DISTANCE_M
+    if not all(least <= value <= most for value in values):
+        raise InputError(f'--distances {text!r}: all must be from {least:g} to {most:g} m')
     return sorted(values)
 
 
 def _camera(args: argparse.Namespace) -> Camera:
     if args.calibration is not None:
         return load_camera(args.calibration)
-    if not args.lens >= _SHORTEST_MM:
-        raise InputError(f'--lens {args.lens:g} mm is no focal length: those are in millimetres')
+    shortest, longest = LENS_MM
+    if not shortest <= args.lens <= longest:
+        raise InputError(f'--lens {args.lens:g} mm is no focal length: in millimetres, {shortest:g} to {longest:g}')
     focal = args.lens / _PITCH_MM
     return Camera(640, 512, np.array([[focal, 0.0, 319.5], [0.0, focal, 255.5], [0.0, 0.0, 1.0]]))
 
 
 def _expectation(args: argparse.Namespace, measurements: Measurements, distance: float, contrast: float) -> Expectation:
-    if not (args.netd > 0.0 and contrast > 0.0 and args.fog >= 0.0):
-        raise InputError('--netd and --contrast must be positive, --fog must not be negative')
-    seen = contrast * float(np.exp(-args.fog * distance)) / args.netd
+    # Behind enough fog it is smaller than any number.
+    seen = max(contrast * float(np.exp(-args.fog * distance)) / args.netd, float(np.finfo(float).tiny))
     return expect(
         measurements,
         _camera(args),

@@ -2,6 +2,7 @@
 
 import argparse
 
+from thermal_fiducial.cli.ranges import SIDE_M
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.errors import InputError
 
@@ -44,7 +45,8 @@ def _side(text: str) -> float:
         side = float(text)
     except ValueError:
         side = 0.0
-    if not 0.0 < side < 100.0:
+    least, most = SIDE_M
+    if not least <= side <= most:
         raise argparse.ArgumentTypeError(f'{text!r} is no side in metres')
     return side
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import textwrap
 
 from thermal_fiducial.cli.progress import counted, progress_bar
+from thermal_fiducial.cli.ranges import CONTRAST_K, FOG_PER_M
 from thermal_fiducial.cli.simulate_corners import write_corner_flight
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import STORAGES
@@ -22,8 +23,8 @@ _OWN = "the scenario's"
 _RANGES = {
     'seconds': (1.0, 3600.0),
     'seed': (0, 2**32 - 1),
-    'contrast': (0.01, 400.0),
-    'fog': (0.0, 100.0),
+    'contrast': CONTRAST_K,
+    'fog': FOG_PER_M,
     'lag': (0.0, 0.1),
     'readout': (0.0, 0.05),
     'frame_rate': (1.0, 120.0),

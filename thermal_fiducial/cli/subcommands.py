@@ -25,16 +25,21 @@ def add_remap(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def whole_number(least: int) -> Callable[[str], int]:
-    """Type of an argument: a whole number from ``least`` to that of the largest seed, 2^32 - 1."""
+#: The largest seed.
+_MOST = 2**32 - 1
+
+
+def whole_number(least: int, most: int = _MOST) -> Callable[[str], int]:
+    """Type of an argument: a whole number from ``least`` to ``most``."""
+    allowed = f'{least} or more' if most == _MOST else f'{least} to {most}'
 
     def number(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
             value = least - 1
-        if not least <= value < 2**32:
-            raise argparse.ArgumentTypeError(f'{text!r} is not a whole number, {least} or more')
+        if not least <= value <= most:
+            raise argparse.ArgumentTypeError(f'{text!r} is not a whole number, {allowed}')
         return value
 
     return number
@@ -55,15 +60,22 @@ def number(least: float, most: float, unit: str = '') -> Callable[[str], float]:
     return within
 
 
+def any_path(text: str) -> Path:
+    """Type of an argument: a path; an empty one would be the folder in which the command runs."""
+    if not text:
+        raise argparse.ArgumentTypeError('a path cannot be empty')
+    return Path(text)
+
+
 def file_to_write(text: str) -> Path:
     """Type of an argument: a file that the command will write, refused before the work that leads to it.
 
     Raises
     ------
     argparse.ArgumentTypeError
-        Its folder is not there, or it is a folder itself.
+        Its folder is not there, or it is a folder itself, or nothing.
     """
-    path = Path(text)
+    path = any_path(text)
     if not path.parent.is_dir():
         raise argparse.ArgumentTypeError(f'{path}: no folder {path.parent}')
     if path.is_dir():

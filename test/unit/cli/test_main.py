@@ -57,6 +57,10 @@ def test_wrong_usage_names_what_lists_the_arguments(argv, lists, capsys):
         ['markers', 'dictionary', 'own.yaml', '--restarts', '2.5'],
         ['markers', 'measure', 'own.yaml', '--markers', '0'],
         ['markers', 'plan', '--bits', '-4'],
+        ['markers', 'plan', '--bits', '99999'],
+        ['calibrate', 'intrinsics', 'views', '--grid', '99999', '99999'],
+        ['calibrate', 'intrinsics', 'views', '--every', '0'],
+        ['calibrate', 'intrinsics', 'views', '--longer-rows', '-1'],
         ['calibrate', 'intrinsics', 'views', '--out', 'tau2.yaml', '--target', 'circles', '--most-views', '0'],
     ],
 )
@@ -67,6 +71,70 @@ def test_numbers_that_cannot_be_are_named_with_their_option(words, capsys):
     last = capsys.readouterr().err.splitlines()[-1]
     (option,) = (word for word in words if f'argument {word}: ' in last)
     assert f'argument {option}: {words[words.index(option) + 1]!r} is not a whole number' in last
+
+
+@pytest.mark.parametrize(
+    ('command', 'option'),
+    [
+        *(
+            ('markers plan', option)
+            for option in ('--netd', '--stand-off', '--contrast', '--after', '--loss', '--fog', '--distances', '--lens')
+        ),
+        *(('calibrate intrinsics views', option) for option in ('--spacing', '--diameter', '--focal-px')),
+        *(('map move map.yaml 1 --position 0 0 0', option) for option in ('--sigma', '--sigma-deg')),
+        ('map show map.yaml', '--marker-size'),
+    ],
+)
+@pytest.mark.parametrize('value', ['-1', '1e9', '1e300', 'nan', 'inf'])
+def test_numbers_that_nothing_real_has_are_named_with_their_option(command, option, value, capsys):
+    """Nothing is computed with them, which took long, ended in a traceback, or said something about nothing."""
+    try:
+        status = main([*command.split(), f'{option}={value}'])
+    except SystemExit as stopped:
+        status = stopped.code
+    assert status == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert option in last
+    assert f'{float(value):g}' in last or repr(value) in last
+
+
+@pytest.mark.parametrize('side', ['1e-300', '0'])
+def test_lengths_that_are_next_to_nothing_are_refused(side, capsys):
+    for command, option in (('calibrate intrinsics views', '--spacing'), ('map show map.yaml', '--marker-size')):
+        with pytest.raises(SystemExit, match='2'):
+            main([*command.split(), option, side])
+        assert f'argument {option}: {side!r} is no' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    'words',
+    [
+        ['map', 'history', ''],
+        ['map', 'undo', ''],
+        ['markers', 'make', '--out', ''],
+        ['markers', 'measure', ''],
+        ['evaluate', 'run', '--truth', ''],
+        ['replay', 'bag', '--out', ''],
+    ],
+)
+def test_an_empty_path_is_not_the_folder_of_the_command(words, capsys):
+    with pytest.raises(SystemExit, match='2'):
+        main(words)
+    assert 'a path cannot be empty' in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize('option', ['--formats', '--paper'])
+def test_what_a_message_quotes_is_on_its_line(tmp_path, option, capsys):
+    assert main(['markers', 'make', '--ids', '0', '--out', str(tmp_path), option, 'a\nb']) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'a?b' in line
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('topic', ['-', '/', 'a b'])
+def test_a_topic_that_cannot_be_is_named(topic, capsys):
+    assert main(['check-bridge', '--topic', topic]) == 2
+    assert capsys.readouterr().err == f'thermal-fiducial check-bridge: --topic {topic!r} is not the name of a topic\n'
 
 
 @pytest.mark.parametrize('name', ['a' * 300, 'a/' * 3000, 'file/b'])

@@ -8,9 +8,12 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
+from rclpy.validate_topic_name import validate_topic_name
 from sensor_msgs.msg import Imu
 
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.watching.observer import observer
 
@@ -67,7 +70,14 @@ def listen(
     topic : odometry to subscribe to; empty: the running filter's output for a flight controller, remapped or not
     announce : called with the topics once they are resolved
     ros_arguments : as after ``--ros-args``
+
+    Raises
+    ------
+    InputError
+        No topic can have that name.
     """
+    if topic:
+        _require_name(topic)
     with observer('check_bridge', ros_arguments, domain_id) as (node, executor):
         topics = Topics(*map(node.resolve_topic_name, astuple(_find(node, executor, topic))))
         announce(topics)
@@ -80,6 +90,13 @@ def listen(
         node.create_subscription(DiagnosticArray, '/diagnostics', lambda array: _note(array, said), qos.RESULT)
         _spin(executor, seconds, lambda: False)
         return _links(node, topics, said)
+
+
+def _require_name(topic: str) -> None:
+    try:
+        validate_topic_name(topic)
+    except InvalidTopicNameException:
+        raise InputError(f'--topic {topic!r} is not the name of a topic') from None
 
 
 def _find(node: Node, executor: Any, topic: str) -> Topics:
