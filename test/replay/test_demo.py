@@ -71,6 +71,27 @@ def test_a_folder_of_somebody_else_is_never_replaced(tmp_path, capsys):
     assert (tmp_path / 'thesis.tex').read_text() == 'years of work'
 
 
+def test_a_demo_that_is_interrupted_while_it_removes_an_earlier_one_is_followed_by_another(tmp_path, monkeypatch):
+    def interrupted(path):
+        """The first of what is removed is gone."""
+        sorted(path.iterdir())[0].unlink()
+        raise KeyboardInterrupt
+
+    (tmp_path / MARK).touch()
+    (tmp_path / 'bag').mkdir()
+    for name in ('one', 'two'):
+        (tmp_path / 'bag' / name).touch()
+    with monkeypatch.context() as patched:
+        patched.setattr(demo.shutil, 'rmtree', interrupted)
+        assert main(['demo', '--out', str(tmp_path)]) == 130
+    assert (tmp_path / 'bag' / 'two').exists()
+    # Refuses before it simulates what it would refuse to replace.
+    monkeypatch.setattr(demo, '_simulate', lambda bag, flight: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(['demo', '--out', str(tmp_path)])
+    assert [path.name for path in tmp_path.iterdir()] == [MARK]
+
+
 def test_a_file_in_the_way_is_refused(tmp_path, capsys):
     (tmp_path / 'file').touch()
     assert main(['demo', '--out', str(tmp_path / 'file')]) == 2

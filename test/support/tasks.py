@@ -4,6 +4,8 @@ import os
 from pathlib import Path
 import time
 
+from thermal_fiducial.files.work_folders import work_folder
+
 
 def work(task):
     """Process that works, and the answer."""
@@ -40,3 +42,11 @@ def write_twice(begun, ended):
 def large(megabytes):
     """Bytes that fill any pipe."""
     return bytes(megabytes * 1_000_000)
+
+
+def work_for_ever(out, connection):
+    """Write the folder ``out``, and never finish it."""
+    with work_folder(out) as folder:
+        (folder / out.name).mkdir()
+        connection.send(None)
+        time.sleep(600.0)

@@ -93,12 +93,21 @@ def _make_room(out: Path) -> None:
     if out.exists() and not (out / MARK).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f'{out} exists and is no earlier demo: choose another folder with --out')
     try:
-        if out.exists():
-            shutil.rmtree(out)
-        out.mkdir(parents=True)
+        out.mkdir(parents=True, exist_ok=True)
         (out / MARK).touch()
+        # The mark stays: without it an interrupted demo would leave a folder that the next one refuses.
+        for earlier in out.iterdir():
+            if earlier.name != MARK:
+                _remove(earlier)
     except OSError as error:
         raise InputError(f'{out}: {error.strerror}') from None
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
 
 
 def _simulate(bag: Path, flight: 'FlightPlan') -> None:

@@ -9,9 +9,7 @@ import multiprocessing
 from multiprocessing.connection import Connection
 import os
 from pathlib import Path
-import shutil
 import signal
-import tempfile
 import threading
 from typing import Any
 
@@ -26,6 +24,7 @@ from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPI
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry
 from thermal_fiducial.files.rosbags_types import MAP_FRAME
 from thermal_fiducial.files.trajectory_file import save_tum
+from thermal_fiducial.files.work_folders import work_folder
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.sim import messages
 from thermal_fiducial.sim.imu import ImuRecord
@@ -97,19 +96,14 @@ def write_flight(
         raise InputError(f'{out} exists already')
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f'.{out.name}-', dir=out.parent))
-    except OSError as error:
-        raise InputError(f'{out}: {error.strerror}') from None
-    try:
-        _write_bag(folder / out.name, flight, storage, workers, progress or (lambda _: None))
-        write_side_files(folder / out.name, flight)
-        (folder / out.name).rename(out)
+        with work_folder(out) as folder:
+            _write_bag(folder / out.name, flight, storage, workers, progress or (lambda _: None))
+            write_side_files(folder / out.name, flight)
+            (folder / out.name).rename(out)
     except OSError as error:
         raise InputError(f'{out}: {error.strerror}') from None
     except RendererDiedError:
         raise InputError(f'{out}: a rendering process died, perhaps for lack of memory') from None
-    finally:
-        shutil.rmtree(folder)
 
 
 def _write_bag(folder: Path, flight: FlightPlan, storage: str, workers: int, progress: Callable[[int], None]) -> None:

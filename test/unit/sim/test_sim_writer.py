@@ -223,6 +223,12 @@ def test_nothing_is_left_of_a_failed_flight(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_a_killed_simulation_has_left_is_removed_by_the_next_one(tmp_path):
+    (tmp_path / '.bag-abcdefgh' / 'bag').mkdir(parents=True)
+    write_flight(tmp_path / 'bag', plan(TINY, SECONDS, 3, quality=COARSE))
+    assert [path.name for path in tmp_path.iterdir()] == ['bag']
+
+
 # --- the command --------------------------------------------------------------------------------------
 
 

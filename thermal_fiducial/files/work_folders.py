@@ -1,0 +1,65 @@
+"""Hidden folders for what appears under its own name once it is whole."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+import fcntl
+import os
+from pathlib import Path
+import re
+import shutil
+import tempfile
+
+from thermal_fiducial.files.atomic import locked
+
+
+@contextmanager
+def work_folder(out: Path) -> Iterator[Path]:
+    """A new folder beside ``out``, to be renamed from; removed in the end.
+
+    It is locked as long as its process lives. What killed processes have left beside the same ``out`` is removed.
+
+    Raises
+    ------
+    InputError
+        Another program writes in the folder of ``out`` for too long.
+    OSError
+        From the file system.
+    """
+    # Under the lock of their common folder none is taken for left behind before it has its own lock.
+    with locked(out):
+        for folder in _named_as_those_of(out):
+            # It may be somebody else's.
+            with suppress(OSError):
+                _remove_if_left(folder, out.name)
+        folder = Path(tempfile.mkdtemp(prefix=f'.{out.name}-', dir=out.parent))
+        descriptor = os.open(folder, os.O_RDONLY)
+        _lock(descriptor)
+    try:
+        yield folder
+    finally:
+        os.close(descriptor)
+        shutil.rmtree(folder)
+
+
+def _named_as_those_of(out: Path) -> list[Path]:
+    name = re.compile(rf'\.{re.escape(out.name)}-[a-z0-9_]{{8}}')
+    return [path for path in out.parent.iterdir() if name.fullmatch(path.name)]
+
+
+def _remove_if_left(folder: Path, name: str) -> None:
+    """Remove a folder that holds nothing but what ``name`` would become, unless a process has locked it."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        if {item.name for item in folder.iterdir()} <= {name} and _lock(descriptor):
+            shutil.rmtree(folder)
+    finally:
+        os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool:
+    """Lock a folder until its descriptor is closed; False if it is locked, or the file system has no locks."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
