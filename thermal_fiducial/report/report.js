@@ -94,11 +94,17 @@
 
   dark.addEventListener('change', () => drawn.forEach((plot) => Plotly.relayout(plot, scheme(plot.layout))));
   const links = new Map([...document.querySelectorAll('nav a')].map((link) => [link.hash.slice(1), link]));
-  const watch = new IntersectionObserver((entries) => entries.forEach((entry) => {
-    if (!entry.isIntersecting) return;
-    links.forEach((link) => link.classList.remove('here'));
-    links.get(entry.target.id)?.classList.add('here');
-  }), { rootMargin: '-60px 0px -70% 0px' });
-  document.querySelectorAll('[id]').forEach((part) => { if (links.has(part.id)) watch.observe(part); });
+  const parts = [...links.keys()].map((id) => document.getElementById(id)).filter(Boolean);
+  // The part in whose beginning, or behind it, the upper third of the window ends; in a tall one 300 px count as that.
+  const mark = () => {
+    const line = Math.min(0.3 * window.innerHeight, 300);
+    const begun = parts.filter((part) => part.getBoundingClientRect().top <= line);
+    const atEnd = window.scrollY > 0 && window.scrollY + window.innerHeight >= document.documentElement.scrollHeight - 2;
+    const here = atEnd ? parts.at(-1) : begun.at(-1) ?? parts[0];
+    links.forEach((link, id) => link.classList.toggle('here', id === here?.id));
+  };
+  window.addEventListener('scroll', mark, { passive: true });
+  window.addEventListener('resize', mark);
+  mark();
   start();
 })();

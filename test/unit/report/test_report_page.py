@@ -224,6 +224,55 @@ def test_nothing_is_wider_than_a_phone(run_folder, tmp_path):
     assert found[3] == ''
 
 
+#: Goes to places of a page and notes which entry of its navigation is marked: at the top, at a section, at the figures
+#: behind the header, at the end.
+READER = """<script>
+window.onload = () => {
+  const places = [() => 0, () => from('#pose'), () => from('.cards'), () => document.body.scrollHeight];
+  const from = (part) => document.querySelector(part).getBoundingClientRect().top + scrollY - 60;
+  const marked = [];
+  for (const place of places) {
+    scrollTo({ top: place(), behavior: 'instant' });
+    // A browser without a window draws no frames, with which the event would come.
+    window.dispatchEvent(new Event('scroll'));
+    marked.push([...document.querySelectorAll('nav a.here')].map((link) => link.textContent).join('+'));
+  }
+  document.body.dataset.marked = marked.join();
+};
+</script>"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason='no chromium')
+@pytest.mark.parametrize(
+    ('height', 'marked'), [(800, 'Overview,Pose,Overview,Nodes'), (20_000, 'Overview,Overview,Overview,Overview')]
+)
+def test_the_navigation_marks_where_one_reads(run_folder, tmp_path, height, marked):
+    """In a window, and in one that shows the whole page; without the plots, which the places do not need."""
+    run = shutil.copytree(run_folder, tmp_path / 'run')
+    said = {'pose_ekf': {'seconds since accepted pose': '2.4728e-05'}}
+    (run / 'summary.json').write_text(
+        json.dumps(json.loads((run / 'summary.json').read_text()) | {'diagnostics': said})
+    )
+    page = without_library(write_page(*evaluate_run(run)).read_text())
+    (tmp_path / 'report.html').write_text(page.replace('</body>', READER + '</body>'))
+    command = [
+        CHROMIUM, '--headless=new', '--no-sandbox', '--disable-gpu', '--no-first-run',
+        f'--user-data-dir={tmp_path / "browser"}', f'--window-size=1300,{height}', '--virtual-time-budget=5000',
+        '--dump-dom', (tmp_path / 'report.html').as_uri(),
+    ]  # fmt: skip
+    dom = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False).stdout
+    found = re.search(r'<body[^>]*data-marked="([^"]*)"', dom)
+    assert found, dom[-2000:]
+    assert found[1] == marked
+
+
+def test_a_number_and_its_percent_sign_are_not_parted(page):
+    cells = [cell for cell in re.findall(r'<td[^>]*>([^<]*)</td>', page) if '%' in cell]
+    assert cells
+    assert not [cell for cell in cells if ' %' in cell]
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason='no chromium')
 def test_a_browser_draws_every_chart(run_folder, tmp_path):
