@@ -19,10 +19,10 @@ def pixel_noise(counts: Counts | Gray | Float32Array) -> float:
     Differences along a column do not contain the column pattern. With whole counts and noise below half a count the
     median may be 0; the result is half a count then.
     """
-    rows = counts[4::16, ::3]
-    below = counts[5::16, ::3]
+    rows = counts[4::16]
+    below = counts[5::16]
     count = min(len(rows), len(below))
-    difference = cv2.absdiff(np.ascontiguousarray(rows[:count]), np.ascontiguousarray(below[:count])).ravel()
+    difference = cv2.absdiff(rows[:count], below[:count])[:, ::3].ravel()
     middle = difference.size // 2
     return max(float(np.partition(difference, middle)[middle]) * SIGMA_OF_MEDIAN / math.sqrt(2.0), 0.5)
 

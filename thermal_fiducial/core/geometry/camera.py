@@ -36,7 +36,7 @@ _BEFORE_FOLD = 0.9
 _NO_COEFFICIENT = 1e-15
 # Coefficients of the derivative of angle + k1 angle^3 + k2 angle^5 ... with respect to the angle.
 _RISE = np.arange(1, 10, 2)
-_EYE = np.eye(3)
+_EYE, _STILL = np.eye(3), np.zeros(3)
 
 
 @dataclass(frozen=True)
@@ -139,14 +139,14 @@ class Camera:
         x = np.asarray(normalised, dtype=np.float64)
         if not x.size:
             return x, np.zeros((*x.shape, 2))
-        still, points = np.zeros(3), np.ones((x.size // 2, 1, 3))
-        points[:, 0, :2] = x.reshape(-1, 2)
+        points = np.empty((x.size // 2, 1, 3))
+        points[:, 0, :2], points[:, 0, 2] = x.reshape(-1, 2), 1.0
         # At depth 1 its derivative by a translation of the camera is the one wanted. OpenCV leaves a skew of K out.
         if self.model == 'equidistant':
-            distorted, J = cv2.fisheye.projectPoints(points, still, still, _EYE, self.D)
+            distorted, J = cv2.fisheye.projectPoints(points, _STILL, _STILL, _EYE, self.D)
             J = J[:, 11:13]
         else:
-            distorted, J = cv2.projectPoints(points, still, still, _EYE, self.D)
+            distorted, J = cv2.projectPoints(points, _STILL, _STILL, _EYE, self.D)
             J = J[:, 3:5]
         # One product of matrices costs less than one for each point.
         uv = distorted.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]

@@ -128,6 +128,8 @@ def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray, edge_px: floa
     found = np.array(quads, dtype=np.float64)
     sides = np.sqrt(squared_sides(found))
     large = (sides >= min_side_px).all(axis=1)
+    if not large.any():
+        return np.zeros((0, 4, 2))
     return _clockwise(_at_edges(found[large], sides[large].mean(axis=1), np.array(spots)[large], edge_px))
 
 

@@ -84,7 +84,7 @@ def twist_by_odometry(
     known = float(off @ off) + noise.diagonal() / RANDOM.diagonal()
     acceleration, unsure = off @ values / known, noise / known + float(t[-1] - t[0]) * _CHANGES
     # In all coordinates, as the rate's noise is in the velocity of a camera with a lever arm, too.
-    averaged = transfer @ np.diag([1.0] * 3 + [1.0 / math.sqrt(len(t))] * 3)
+    averaged = transfer * ([1.0] * 3 + [1.0 / math.sqrt(len(t))] * 3)
     covariance = averaged @ typical @ averaged.T + (middle + lag) ** 2 * unsure + clock_std_s**2 * RANDOM + _LEAST
     return Twist(values.sum(axis=0) / len(t) - middle * acceleration, covariance, acceleration, unsure)
 
