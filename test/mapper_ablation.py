@@ -5,7 +5,7 @@ twentieth without it. A mechanism is switched off by putting what does nothing i
 arguments: only these. Recordings are taken where ``THERMAL_FIDUCIAL_DATA`` names their folder, else left out.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 import sys
 from types import SimpleNamespace
@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from support.mapper_scenes import Figures, SCENES
 from support.taken_out import ablation_row, lines_of
+
+from thermal_fiducial.core.mapping.localization import locate
 
 MAPPING = 'thermal_fiducial.core.mapping'
 #: Change of a figure that is worth printing.
@@ -50,6 +52,11 @@ def _independent(gains: Any, draws: Any) -> Any:
     return np.sqrt(len(draws)) * np.concatenate(list(gains @ draws), axis=-1)
 
 
+def _placed_together(stamp_ns: int, sight: Any, **given: Any) -> Any:
+    """The camera from markers of which none counts as surveyed."""
+    return locate(stamp_ns, replace(sight, surveyed=np.zeros_like(sight.surveyed)), **given)
+
+
 MECHANISMS = {
     'learned bias of corners': Mechanism(
         ('wrong lens', 'board', 'moved markers'), ('corner_bias:CornerBias',), {'corner_bias:CornerBias.add': _ignored}
@@ -63,6 +70,11 @@ MECHANISMS = {
         ('uneven map', 'chain'),
         ('localization:_JointFit.map_weights',),
         {'localization:_JointFit.map_weights': lambda self, *_: np.ones(len(self.sight.markers))},
+    ),
+    'joint weights of surveyed markers': Mechanism(
+        ('uneven map', 'surveyed board'),
+        ('localization:_of_survey',),
+        {'mapper:locate': _placed_together},
     ),
     'alternative pose': Mechanism(
         ('small markers', 'chain', 'tags test_16'),

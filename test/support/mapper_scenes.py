@@ -101,8 +101,11 @@ def _errors(what: str, poses: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -
     }
 
 
-def board() -> Figures:
-    """Every other frame of a real calibration flight before 36 tags, on the map of the board."""
+def board(surveyed: bool = False) -> Figures:
+    """Every other frame of a real calibration flight before 36 tags, on the map of the board.
+
+    ``surveyed``: each tag off by 5 mm and 20 mrad of its own, as its covariance says.
+    """
     flight = real_flights.april_board('cam0')
     config = MarkerMapperConfig(
         mode='localization',
@@ -110,12 +113,25 @@ def board() -> Figures:
         camera_position=tuple(flight.T_body_camera[:3, 3]),
         camera_orientation=tuple(quaternion_from_rotation(flight.T_body_camera[:3, :3])),
     )
-    mapper, located = MarkerMapper(config, flight.marker_map), []
+    marker_map = _surveyed(flight.marker_map, (0.005, 0.02)) if surveyed else flight.marker_map
+    mapper, located = MarkerMapper(config, marker_map), []
     for stamp, rows in list(flight.frames.items())[::2]:
         pose = mapper.process(stamp, rows, flight.camera).pose
         if pose is not None and flight.reference_ns[0] <= stamp <= flight.reference_ns[-1]:
             located.append((flight.truth([stamp])[0] @ flight.T_body_camera, pose.T_map_camera, pose.covariance))
     return {'located': len(located), **_errors('pose', located)}
+
+
+def _surveyed(marker_map: MarkerMap, stds: tuple[float, float]) -> MarkerMap:
+    """The map by a survey of each marker: positions and rotations off by ``stds`` [m, rad] along each axis."""
+    rng, of_each = np.random.default_rng(0), np.repeat(stds, 3)
+    measured = {
+        key: MapMarker(
+            key, marker.size, False, retract(marker.T_map_marker, of_each * rng.normal(size=6)), np.diag(of_each**2)
+        )
+        for key, marker in marker_map.markers.items()
+    }
+    return MarkerMap(measured)
 
 
 def _figures_of_maps(maps: list[tuple[MarkerMap, dict[int, np.ndarray]]]) -> Figures:
@@ -370,6 +386,6 @@ SCENES: dict[str, Callable[[], Figures]] = {
     'optimistic corners': optimistic_corners,
 }
 if 'THERMAL_FIDUCIAL_DATA' in os.environ:
-    SCENES |= {'carpet': carpet, 'board': board} | {
+    SCENES |= {'carpet': carpet, 'board': board, 'surveyed board': lambda: board(surveyed=True)} | {
         f'tags {name}': _recorded_tags(name) for name in ('test_16', 'test_22')
     }

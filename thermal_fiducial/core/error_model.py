@@ -210,6 +210,20 @@ def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors)
     return np.asarray(own / (own + pixels**2))
 
 
+def survey_for_weights(of_survey: FloatArray, noise: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Covariances (N, 8, 8) of corners by errors of a survey, as weights need them beside the corners' noise alone.
+
+    Weights have no bias of the corners, as all markers have the same. It counts beside an error that each has for
+    itself: the survey's variance is divided by as much as the bias would add to the noise.
+
+    Parameters
+    ----------
+    of_survey : (N, 8, 8) by the error of each marker's pose in the map [px^2]
+    noise : (N,) standard deviation of the corners [px]
+    """
+    return np.asarray((noise**2 / (noise**2 + errors.corner_px**2))[:, None, None] * of_survey)
+
+
 def decision_weights(noise: FloatArray, errors: SystematicErrors) -> FloatArray:
     """Factors (N,) on weights of markers with corner ``noise`` (N,) [px] that add the bias for decisions."""
     return np.asarray(noise**2 / (noise**2 + errors.decision_px**2))

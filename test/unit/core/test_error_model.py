@@ -159,7 +159,8 @@ def test_white_and_systematic_errors_are_apart():
     rng = np.random.default_rng(3)
     poses = wall(rng)
     covariance = np.diag([1e-4] * 3 + [1e-5] * 3)
-    unsure = MarkerMap({i: MapMarker(i, SIZE, False, T, covariance) for i, T in poses.items()})
+    # Placed by a mapper, one by another: their errors are common.
+    unsure = MarkerMap({i: MapMarker(i, SIZE, False, T, covariance, observations=1) for i, T in poses.items()})
     rows = see(flight(0.0), poses, 0.02, rng)
     located = MarkerMapper(MarkerMapperConfig(mode='localization'), unsure).locate(stamp(0), rows, CAMERA).outcome
     # 0.02 px at 4 m and 529 px of focal length, from thirty corners, beside a centimetre of the map.

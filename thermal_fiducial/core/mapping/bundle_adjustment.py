@@ -101,8 +101,13 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
     markers, inconsistent = {}, {}
     for i in np.flatnonzero(~problem.held).tolist():
         key, own = problem.ids[i], problem.marker == i
-        adjusted = {'T_map_marker': now.state.T_map_marker[i], 'covariance': covariances[i], 'draws': draws[i]}
-        markers[key] = replace(snapshot.markers[key], **adjusted)
+        markers[key] = replace(
+            snapshot.markers[key],
+            T_map_marker=now.state.T_map_marker[i],
+            covariance=covariances[i],
+            draws=draws[i],
+            surveyed=False,
+        )
         if two_places(now.r[own], now.J_marker[own], ~full[own]):
             inconsistent[key] = outliers[key]
     return AdjustedMap(

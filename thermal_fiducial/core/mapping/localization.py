@@ -17,6 +17,7 @@ from thermal_fiducial.core.error_model import (
     noise_factor,
     noise_of_pose,
     of_single_error,
+    survey_for_weights,
     SystematicErrors,
 )
 from thermal_fiducial.core.geometry.camera import Camera, inverse_2x2
@@ -35,6 +36,9 @@ DECISIVE = 20.0
 WIDE = np.deg2rad(25.0)
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.
 _PROPOSERS = 4
+# Gauss-Newton steps with the joint weights of surveyed markers, after the first: more of them change no figure by a
+# hundredth, one alone leaves some a hundredth worse.
+_STEPS_IN_SURVEY = 2
 # Standard deviation of a rotation beyond which nothing is known of it, and its linearisation means nothing [rad].
 _NOTHING_KNOWN = 1.0
 
@@ -66,7 +70,7 @@ def locate(
     if not np.all(np.isfinite(seen.residuals)):
         return Refusal(f'no camera pose explains {names(sight)}')
     # Steps 5 and 6: refined with the weights of their errors.
-    found = frame.refined(T, seen, by_map * marker_weights(seen.errors_px, sight.noise_px, model))
+    found = frame.refined(T, seen, frame.weights(seen, by_map))
     T_other = None if found is None else frame.alternative(found, hypotheses)
     if found is None or T_other is None:
         return found or Refusal(f'the pose from {names(sight)} is not determined')
@@ -102,25 +106,57 @@ class _JointFit:
     model: SystematicErrors
     fit: CameraFit
 
-    def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
-        """One Gauss-Newton step from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
+    def weights(self, seen: Reprojected, by_map: FloatArray) -> FloatArray:
+        """Weights (N,) of the markers by their errors, and ``by_map`` (N,) of those that were not surveyed."""
+        sight = self.sight
+        of_survey = np.diagonal(_of_survey(sight, seen), axis1=1, axis2=2).mean(axis=1)
+        by_errors = marker_weights(seen.errors_px, np.sqrt(sight.noise_px**2 + of_survey), self.model)
+        return np.asarray(np.where(sight.surveyed, 1.0, by_map) * by_errors)
 
-        The same linearisation, in corners, map and scale, gives the covariances. None if the markers do not determine
-        the pose.
+    def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
+        """Gauss-Newton step from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
+
+        With surveyed markers more steps: their corners have joint weights here, which move the solution. The last
+        linearisation, in corners, map and scale, gives the covariances. None if the markers do not determine the pose.
         """
-        n, residuals = len(weights), seen.residuals[..., None]
-        information = inverse_2x2(self.sight.observed.covariances) * weights[:, None, None, None]
-        squared = (residuals * (information @ residuals)).sum(axis=(-2, -1))
-        robust = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
+        found = self._stepped(T_map_camera, seen, weights)
+        for _ in range(_STEPS_IN_SURVEY if self.sight.surveyed.any() else 0):
+            if found is None:
+                return None
+            T_map_camera = found.pose.T_map_camera
+            found = self._stepped(T_map_camera, self.sight.reprojected(self.camera, T_map_camera), weights)
+        return found
+
+    def _stepped(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
+        """The location after one Gauss-Newton step; None if that is not determined."""
+        n, residuals = len(weights), seen.residuals
+        if not np.all(np.isfinite(residuals)):
+            return None
+        information, chi2 = self._information(seen, weights)
         J = seen.J_camera.reshape(8 * n, 6)
-        weighted = (information / robust @ J.reshape(n, 4, 2, 6)).reshape(8 * n, 6)
+        weighted = (information @ seen.J_camera).reshape(8 * n, 6)
         try:
             gains = np.linalg.inv(J.T @ weighted) @ weighted.T
         except np.linalg.LinAlgError:
             return None
-        step = gains @ seen.residuals.ravel()
-        after = replace(seen, residuals=seen.residuals - (J @ step).reshape(n, 4, 2))
-        return self._location(T_map_camera, step, gains, float(squared.sum()), after, weights)
+        step = gains @ residuals.ravel()
+        after = replace(seen, residuals=residuals - (J @ step).reshape(n, 4, 2))
+        return self._location(T_map_camera, step, gains, chi2, after, weights)
+
+    def _information(self, seen: Reprojected, weights: FloatArray) -> tuple[FloatArray, float]:
+        """Robust information (N, 8, 8) of the markers' corners [1/px^2], and chi square of their residuals.
+
+        A corner is an outlier by what the others of its marker leave of it: errors of a survey move them together.
+        """
+        sight, residuals = self.sight, seen.residuals.reshape(-1, 8, 1)
+        of_survey = survey_for_weights(_of_survey(sight, seen), sight.noise_px, self.model)
+        information = weights[:, None, None] * _inverse(of_survey, sight.observed.covariances)
+        weighted = information @ residuals
+        pulls, of_each = weighted.reshape(-1, 4, 2, 1), _corner_blocks(information)
+        squared = (pulls * (inverse_2x2(of_each) @ pulls)).sum(axis=(-2, -1))
+        excess = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
+        robust = weights[:, None, None] * _inverse(of_survey, sight.observed.covariances * excess)
+        return robust, float((residuals * weighted).sum())
 
     def _location(
         self,
@@ -173,7 +209,8 @@ class _JointFit:
         apart = rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE
         if not np.any(apart):
             return None
-        weights = found.weights * decision_weights(self.sight.noise_px, self.model)
+        by_map = np.where(self.sight.surveyed, self.map_weights(T), 1.0)
+        weights = by_map * found.weights * decision_weights(self.sight.noise_px, self.model)
         starts = np.stack([T, hypotheses[apart][0]])
         (T, other), chi2, _ = self.fit.solve(starts, weights, inlier=np.inf)
         refuted = chi2[1] - chi2[0] > DECISIVE * noise_factor(float(chi2[0]), 8 * len(weights) - 6)
@@ -199,10 +236,32 @@ def marker_weights(errors_px: FloatArray, noise_px: FloatArray, model: Systemati
 
     Parameters
     ----------
-    noise_px : (N,) standard deviation of a coordinate of the corners
+    noise_px : (N,) standard deviation of a coordinate of the corners, by noise and survey
     """
     expected = 2.0 * (noise_px**2 + model.corner_px**2)
     return np.asarray(np.minimum(1.0, expected / np.maximum(errors_px**2, TINY)))
+
+
+def _of_survey(sight: Sight, seen: Reprojected) -> FloatArray:
+    """Covariances (N, 8, 8) [px^2] of the corners by errors of the survey: zero of markers that were not surveyed."""
+    J = np.where(sight.surveyed[:, None, None], seen.J_marker, 0.0)
+    return np.asarray(J @ sight.map_covariances @ J.swapaxes(-1, -2))
+
+
+def _inverse(of_survey: FloatArray, of_corners: FloatArray) -> FloatArray:
+    """Inverses (N, 8, 8) of the sums of joint covariances (N, 8, 8) and those of each corner (N, 4, 2, 2)."""
+    if of_survey.any():
+        covariances = of_survey.copy()
+        _corner_blocks(covariances)[...] += of_corners
+        return np.asarray(np.linalg.inv(covariances))
+    information = np.zeros_like(of_survey)
+    _corner_blocks(information)[...] = inverse_2x2(of_corners)
+    return information
+
+
+def _corner_blocks(matrices: FloatArray) -> FloatArray:
+    """The blocks (N, 4, 2, 2) on the diagonals of (N, 8, 8): a view."""
+    return np.asarray(np.einsum('nkikj->nkij', matrices.reshape(-1, 4, 2, 4, 2)))
 
 
 def _hypotheses(sight: Sight, prior: FloatArray | None) -> FloatArray:

@@ -48,6 +48,8 @@ class Sight(Stacked):
     scale_arms: FloatArray
     #: (N, 6, K) joint draws of their errors
     draws: FloatArray
+    #: (N,) which of them were surveyed one by one: their errors are independent
+    surveyed: BoolArray
 
     @staticmethod
     def of(observed: Observations, marker_map: MarkerMap) -> 'Sight':
@@ -69,6 +71,7 @@ class Sight(Stacked):
             covariances,
             np.zeros_like(positions) if given else arms_of_scale(positions, marker_map.anchors),
             np.array([marker.draws for marker in known]).reshape(-1, *NO_DRAWS.shape),
+            np.array([marker.surveyed for marker in known], dtype=np.bool_),
         )
 
     def reprojected(self, camera: Camera, T_map_camera: FloatArray) -> 'Reprojected':

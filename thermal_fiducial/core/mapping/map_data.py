@@ -54,6 +54,8 @@ class MapMarker:
     trusted: bool = True
     #: (6, K) draws of its error but for the scale, jointly with those of the other markers of a mapper; a file has none
     draws: FloatArray = field(default_factory=lambda: NO_DRAWS, compare=False, repr=False)
+    #: measured by itself, before any flight: its error is independent of those of all other markers
+    surveyed: bool = field(default=False, compare=False, repr=False)
 
     def seen(self, stamp_ns: int, error_px: float) -> 'MapMarker':
         """The marker after one more observation; without ``replace``, as this runs for every marker of every frame."""
@@ -63,7 +65,7 @@ class MapMarker:
         first = self.first_seen_ns if self.observations else stamp_ns
         return MapMarker(
             self.id, self.size, self.fixed, self.T_map_marker, self.covariance,
-            math.sqrt(mean_square), count, first, stamp_ns, self.trusted, self.draws,
+            math.sqrt(mean_square), count, first, stamp_ns, self.trusted, self.draws, self.surveyed,
         )  # fmt: skip
 
 
@@ -96,9 +98,8 @@ class MarkerMap:
         for marker_id, marker in adjusted.items():
             own = self.markers.get(marker_id)
             if own is not None and own.trusted:
-                self.markers[marker_id] = replace(
-                    own, T_map_marker=marker.T_map_marker, covariance=marker.covariance, draws=marker.draws
-                )
+                geometry = {name: getattr(marker, name) for name in ('T_map_marker', 'covariance', 'draws', 'surveyed')}
+                self.markers[marker_id] = replace(own, **geometry)
         self.revision += 1
 
     def with_assumed_draws(self, errors: SystematicErrors) -> 'MarkerMap':
@@ -111,7 +112,10 @@ class MarkerMap:
         of_scale = scale_of_map(arms_of_scale(positions, self.anchors), errors)
         placed = np.array([marker.observations > 0 for marker in vague])
         draws = assumed_draws(positions, covariances - of_scale, placed)
-        drawn = {marker.id: replace(marker, draws=own) for marker, own in zip(vague, draws, strict=True)}
+        drawn = {
+            marker.id: replace(marker, draws=own, surveyed=not by_mapper)
+            for marker, own, by_mapper in zip(vague, draws, placed.tolist(), strict=True)
+        }
         return replace(self, markers=self.markers | drawn)
 
     def geometry(self) -> dict[int, tuple[FloatArray, float]]:

@@ -195,7 +195,8 @@ def test_the_covariance_carries_the_uncertainty_of_the_map():
     poses = wall(rng)
     sure = known(poses)
     covariance = np.diag([1e-4] * 3 + [1e-5] * 3)
-    unsure = MarkerMap({i: MapMarker(i, SIZE, False, poses[i], covariance) for i in poses})
+    # Placed by a mapper, one by another: their errors are common.
+    unsure = MarkerMap({i: MapMarker(i, SIZE, False, poses[i], covariance, observations=1) for i in poses})
     rows = see(flight(0.0), poses, 0.02, rng)
     small, large = (mapper(m).process(1, rows, CAMERA).pose for m in (sure, unsure))
     assert small is not None
@@ -253,3 +254,17 @@ def test_a_map_in_memory_gives_the_poses_of_one_from_its_file():
     np.testing.assert_array_equal(on_both[0].covariance, on_both[1].covariance)
     # Not only of the corners: of the map.
     assert np.all(np.linalg.eigvalsh(on_both[0].map_covariance) > 0.0)
+
+
+def test_errors_of_surveyed_markers_are_independent_until_a_refinement_relates_them():
+    rng = np.random.default_rng(6)
+    poses, covariance = wall(rng), np.diag([1e-4] * 3 + [1e-5] * 3)
+    surveyed = MarkerMap({i: MapMarker(i, SIZE, i == 0, poses[i], covariance * (i > 0)) for i in range(4)})
+    m = mapper(surveyed, refinement_period=1.0)
+    for k in range(0, 300, 5):
+        m.process(stamp(k), see(flight(k / 30), poses, 0.05, rng), CAMERA)
+    # Those that the mapper places have errors by the flight.
+    assert len(m.map.markers) > 4
+    assert {i for i, marker in m.map.markers.items() if marker.surveyed} == {1, 2, 3}
+    assert m.refine() is not None
+    assert not any(marker.surveyed for marker in m.map.markers.values())
