@@ -678,7 +678,7 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
     estimate_time_offset: bool = param(True, 'Estimate the error of camera_time_offset.')
     time_offset_random_walk: float = _clock_random_walk(('estimate_time_offset',))
     stamp_jitter: float = param(
-        0.0005,
+        0.005,
         'Initial standard deviation of the jitter of the camera stamps, estimated from the poses. 0: no jitter.',
         unit='s',
         minimum=0.0,

@@ -30,7 +30,3 @@ class FramePeriod:
         if not self._intervals_ns:
             return self.ASSUMED_NS
         return sorted(self._intervals_ns)[(len(self._intervals_ns) - 1) // 2]
-
-    def steady_ns(self, longest: float) -> list[int]:
-        """The latest intervals [ns] without pauses, which are those of more than ``longest`` periods."""
-        return [interval for interval in self._intervals_ns if interval <= longest * self.ns]

@@ -72,12 +72,11 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
 
     def state(self) -> tuple[bytes, str]:
         """Why the last frame was dropped, and faults of the published frames."""
-        repeating = self.cleaner.repeating
-        if self._reason and not (self._reason == FROZEN and repeating):
+        if self._reason and not (self._reason == FROZEN and self.cleaner.repeating):
             return WARN, self._reason
         if self._displayed:
             return OK, 'ok, but 8-bit images: raw counts give corners ten times as accurate'
-        return OK, f'ok, but {repeating.doubt}' if repeating and repeating.doubt else 'ok'
+        return OK, 'ok'
 
     def headline(self) -> str:
         """Message if the image has been frozen for longer than a shutter event, which is over within a second."""

@@ -52,7 +52,8 @@ def contradiction(config: PoseEkfConfig, hypothesis: Hypothesis, innovation: Inn
     """Which sensor of the IMU a pose contradicts that the ``hypothesis`` refuses."""
     turn, shift = innovation.value[:3], innovation.value[3:]
     seconds = (innovation.estimate.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
-    if turn @ np.linalg.solve(np.linalg.inv(innovation.S_inverse)[:3, :3], turn) > config.gate:
+    # The turn has half of the degrees of freedom.
+    if turn @ np.linalg.solve(np.linalg.inv(innovation.S_inverse)[:3, :3], turn) > 0.5 * config.gate:
         apart = f'{math.degrees(np.linalg.norm(turn)):.0f} deg apart after {seconds:.2f} s'
         return Condition('poses contradict the gyroscope', f'{apart}; its units, axes, sign? camera_orientation?')
     apart = f'{np.linalg.norm(shift):.2f} m apart after {seconds:.2f} s'

@@ -23,8 +23,8 @@ WHITE = 0.5
 #: Variance of the white error before anything is learned: it may be all that a pose claims.
 _WHITE_AT_FIRST = 1.0
 #: Least and largest values of the three variances of :class:`PoseNoise`, and the memory [poses] with which they are
-#: learned: poses that claim too little must not be refused for long.
-LIMITS = np.array(((WHITE, 1e-8, 1e-10), (30.0 * WHITE, 2.5e-5, 1e-4)))
+#: learned: poses that claim too little must not be refused for long. Stamps of arrival may jitter by 20 ms.
+LIMITS = np.array(((WHITE, 1e-8, 1e-10), (30.0 * WHITE, 4e-4, 1e-4)))
 _MEMORY = np.array((10.0, 300.0, 300.0))
 #: Weight of the initial values, as information about their logarithms; limit of the normalised squared innovation.
 _PRIOR, _LARGEST_SQUARE = 5.0, 9.0

@@ -13,7 +13,7 @@ import numpy as np
 
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder
-from thermal_fiducial.core.imaging.repeated_frames import Pauses, Repeating
+from thermal_fiducial.core.imaging.repeated_frames import Pauses
 from thermal_fiducial.core.measurements import LATEST_NS
 from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.core.types import Counts, Gray, IntArray
@@ -75,8 +75,8 @@ class FrameCleaner:
         self._filler = BadPixelFiller(self._known_bad, shape) if shape != (0, 0) else None
 
     @property
-    def repeating(self) -> Repeating | None:
-        """How the driver repeats the camera's frames; None if it does not, or while nothing new comes."""
+    def repeating(self) -> bool:
+        """Whether the driver repeats the camera's frames at present, as it is faster than the camera."""
         return self._pauses.repeating
 
     @property

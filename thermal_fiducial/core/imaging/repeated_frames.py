@@ -1,41 +1,8 @@
-"""Frames that a driver sends more than once: what that says of pauses of the camera, and of its stamps."""
+"""Frames that a driver sends more than once: what that says of pauses of the camera."""
 
 from collections import deque
-from dataclasses import dataclass
-import math
-from statistics import fmean
 
 from thermal_fiducial.core.frame_period import FramePeriod
-from thermal_fiducial.core.types import SECOND_NS
-
-#: Jitter of stamps of which the user hears [s]: beyond it the filter takes too long to learn it.
-_UNEVEN_S = 0.003
-
-
-@dataclass(frozen=True, slots=True)
-class Repeating:
-    """A driver that is faster than the camera, and sends its frames several times.
-
-    Its stamps are those of its own ticks, so a new frame may be as old as the ticks are apart. Where the camera's
-    period is no multiple of that, it is older at one time than at another.
-    """
-
-    #: mean interval of new frames, and by how much the intervals differ [ns]
-    period_ns: float
-    spread_ns: int
-
-    @property
-    def jitter(self) -> float:
-        """Standard deviation of the stamps [s]: frames are evenly distributed between the ticks."""
-        return self.spread_ns / SECOND_NS / math.sqrt(12.0)
-
-    @property
-    def doubt(self) -> str:
-        """What the user should know, in words; empty if frames come evenly."""
-        if self.jitter <= _UNEVEN_S:
-            return ''
-        rate = f'new frames come unevenly at {SECOND_NS / self.period_ns:.1f} Hz, as the driver repeats them'
-        return f'{rate}: stamp_jitter {self.jitter:.3f}?'
 
 
 class Pauses:
@@ -83,9 +50,6 @@ class Pauses:
             self._paused, self._paused_ns, self._left = True, max(stamp_ns, self._paused_ns), settling
 
     @property
-    def repeating(self) -> Repeating | None:
-        """How the driver repeats frames; None if it does not, or while nothing new comes."""
-        if self._paused or len(self._repeated) < FramePeriod.INTERVALS or not all(self._repeated):
-            return None
-        steady = self._period.steady_ns(self.LONG)
-        return Repeating(fmean(steady), max(steady) - min(steady))
+    def repeating(self) -> bool:
+        """Whether the driver repeats frames at present, as it is faster than the camera."""
+        return not self._paused and len(self._repeated) == FramePeriod.INTERVALS and all(self._repeated)

@@ -71,30 +71,23 @@ def test_a_camera_that_changes_its_rate_is_followed():
     assert [outcomes[0] for number, outcomes in slow.items() if number > 6] == [''] * (len(slow) - 7)
 
 
-@pytest.mark.parametrize(
-    ('camera_hz', 'driver_hz', 'spread_ms'), [(60 / 7, 30.0, 33.3), (60 / 7, 60.0, 0.0), (7.5, 30.0, 0.0)]
-)
-def test_a_driver_that_repeats_frames_is_known_by_how_unevenly_new_ones_come(camera_hz, driver_hz, spread_ms):
-    """Seven periods of 60 Hz are three or four of 30 Hz. A shutter event is no unevenness."""
+@pytest.mark.parametrize(('camera_hz', 'driver_hz'), [(60 / 7, 30.0), (60 / 7, 60.0), (7.5, 30.0)])
+def test_a_driver_that_repeats_frames_is_known(camera_hz, driver_hz):
+    """Seven periods of 60 Hz are three or four of 30 Hz."""
     cleaner = FrameCleaner(Tau2CameraConfig())
-    assert cleaner.repeating is None
+    assert not cleaner.repeating
     reasons(cleaner, stream(camera_hz, driver_hz, 6.0, CLOSED_S))
-    repeating = cleaner.repeating
-    # The mean of nine intervals; one more or less of the long ones is 3 %.
-    assert repeating.period_ns == pytest.approx(1e9 / camera_hz, rel=0.05)
-    # Stamps are rounded to nanoseconds.
-    assert repeating.spread_ns == pytest.approx(1e6 * spread_ms, abs=1e5)
-    assert repeating.jitter == pytest.approx(1e-3 * spread_ms / np.sqrt(12.0), abs=1e-4)
+    assert cleaner.repeating
 
 
 @pytest.mark.parametrize('rate', [7.5, 30.0])
 def test_a_camera_that_is_as_fast_as_its_driver_repeats_nothing(rate):
     cleaner = FrameCleaner(Tau2CameraConfig())
     reasons(cleaner, stream(rate, rate, 6.0, CLOSED_S))
-    assert cleaner.repeating is None
+    assert not cleaner.repeating
 
 
 def test_a_camera_that_stops_repeats_nothing_any_more():
     cleaner = FrameCleaner(Tau2CameraConfig())
     reasons(cleaner, stream(7.5, 30.0, 4.4, CLOSED_S))
-    assert cleaner.repeating is None
+    assert not cleaner.repeating
