@@ -9,7 +9,20 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.flights import config, errors, Flight, matched, Motion, perfect, rms, run, START_NS, timeline, white_poses
+from support.flights import (
+    config,
+    errors,
+    Flight,
+    IMU,
+    matched,
+    Motion,
+    perfect,
+    rms,
+    run,
+    START_NS,
+    timeline,
+    white_poses,
+)
 
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.filter.ekf import PoseEkf
@@ -385,11 +398,11 @@ def test_a_map_out_of_plumb_costs_little():
         replace(pose, T_map_camera=tilt @ pose.T_map_camera, covariance=turn @ pose.covariance @ turn.T)
         for pose in data.poses
     ]
-    ekf = PoseEkf(config())
+    ekf = PoseEkf(config(imu=IMU))
     states, _ = run(ekf, timeline(data.samples(), poses, 0.03))
     upright = [replace(state, T_map_body=np.linalg.inv(tilt) @ state.T_map_body) for state in states]
     # A degree is 3.5 sigma of the prior: measured 1.26, and as much with the noise of the poses exactly known.
-    assert rms(errors(data, upright, SETTLED)[0]) < 1.35 * position_rms(config())
+    assert rms(errors(data, upright, SETTLED)[0]) < 1.35 * position_rms(config(imu=IMU))
     # one degree, known to the prior's size times what yaw distinguishes from the bias
     assert np.degrees(ekf.diagnostics()['map tilt']) == pytest.approx(1.0, abs=0.3)
 

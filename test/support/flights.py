@@ -4,7 +4,7 @@ About 1 m/s rms in front of one marker 2 m away, in the numbers of ordinary hard
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,8 @@ CAMERA_POSITION = (0.13, 0.02, -0.04)
 CAMERA_ORIENTATION = (-0.5, 0.5, -0.5, 0.5)
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 T_BODY_CAMERA = transform(R_BODY_CAMERA, CAMERA_POSITION)
+#: Its biases walk as those of a good IMU at rest.
+IMU = ImuNoise(gyroscope_random_walk=2.0e-5, accelerometer_random_walk=3.0e-4)
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class Flight:
     motion: Motion | None = None
     imu_rate: float = 200.0
     pose_rate: float = 30.0
-    imu_noise: ImuNoise = field(default_factory=ImuNoise)
+    imu_noise: ImuNoise = IMU
     bias_std: tuple[float, float] = (0.005, 0.05)
     #: rotation error of the camera about its x, y and z [rad]; of the marker in the camera x, y, z [m]
     rotation_std: tuple[float, ...] = (0.018, 0.018, 0.003)
@@ -162,7 +164,7 @@ def perfect(noise: ImuNoise) -> ImuNoise:
     return replace(noise, vibration=0.0, **dict.fromkeys(without, 0.0))
 
 
-MATCHED_IMU = perfect(ImuNoise())
+MATCHED_IMU = perfect(IMU)
 
 
 def timeline(samples: Iterable[ImuSample], poses: Iterable[CameraPose], delay=0.0):

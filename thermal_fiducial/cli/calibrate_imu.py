@@ -8,6 +8,7 @@ import numpy as np
 
 from thermal_fiducial.calibration.sources import imu_track
 from thermal_fiducial.cli.subcommands import add_remap, file_to_write
+from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.reading import naming
@@ -50,7 +51,11 @@ def calibrate_imu(args: argparse.Namespace) -> int:
 
 
 def noise_text(fit: 'ImuNoiseFit') -> str:
-    """Parameter file of the nodes: the rms of the three axes, with each axis as a comment."""
+    """Parameter file of the nodes: the rms of the three axes, with each axis as a comment.
+
+    Random walks are at least the default ones: those of flight do not show at rest.
+    """
+    usual = ImuNoise()
     lines = [
         f'# Allan deviation of {fit.seconds:.0f} s at rest, {fit.rate_hz:.1f} Hz; in brackets x, y, z',
         *([] if fit.seconds >= _LONG_S else [f'# random walks need more than {_LONG_S:.0f} s: take these for bounds']),
@@ -64,8 +69,10 @@ def noise_text(fit: 'ImuNoiseFit') -> str:
         ('gyroscope_random_walk', fit.gyroscope.walk),
         ('accelerometer_random_walk', fit.accelerometer.walk),
     ):
-        axes = ', '.join(f'{value:.2e}' for value in values)
-        lines.append(f'      {name}: {_rms(values):.4e}  # ({axes})')
+        axes, found = ', '.join(f'{value:.2e}' for value in values), _rms(values)
+        least = getattr(usual, name) if name.endswith('walk') else 0.0
+        remark = '' if found >= least else f'in flight; at rest {found:.1e} '
+        lines.append(f'      {name}: {max(found, least):.4e}  # {remark}({axes})')
     for name, sensor in (('gyroscope', fit.gyroscope), ('accelerometer', fit.accelerometer)):
         lines.append(f'# bias instability of the {name}: {_rms(sensor.instability):.2e}')
     return '\n'.join(lines) + '\n'

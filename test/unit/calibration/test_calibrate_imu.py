@@ -69,10 +69,13 @@ def test_the_command_writes_parameters(tmp_path, capsys):
     }  # fmt: skip
     settings = read_settings(out, {})
     assert settings.pose_ekf.imu.gyroscope_noise_density == pytest.approx(3e-3, rel=0.05)
+    # At rest biases walk less than in flight.
+    assert settings.pose_ekf.imu.accelerometer_random_walk == ImuNoise().accelerometer_random_walk
     assert settings.pose_ekf.gravity == PoseEkfConfig().gravity
     printed = capsys.readouterr().out
     assert '1.28 s: ' in printed
     assert 'take these for bounds' in printed
+    assert '# in flight; at rest ' in printed
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.flights import IMU
 from support.scenes import camera_of
 
 from thermal_fiducial.calibration.batch_adjustment import Problem
@@ -95,7 +96,7 @@ def test_increments_are_those_of_the_flight():
     motion = scenario.trajectory(20.0, 1)(times)
     R, dt = motion.rotation.as_matrix(), np.diff(times)[:, None]
     g = np.array([0.0, 0.0, -GRAVITY])
-    found = preintegrate(imu, times, np.zeros((len(dt), 6)), ImuNoise())
+    found = preintegrate(imu, times, np.zeros((len(dt), 6)), IMU)
     R0t = np.swapaxes(R[:-1], 1, 2)
     dv = np.einsum('nij,nj->ni', R0t, np.diff(motion.velocity, axis=0) - g * dt)
     dp = np.einsum('nij,nj->ni', R0t, np.diff(motion.position, axis=0) - motion.velocity[:-1] * dt - 0.5 * g * dt**2)
@@ -114,13 +115,13 @@ def test_derivatives_of_a_preintegration_against_differences(derivative, count, 
     _, imu = recording(SCENARIO, 20.0, 1)
     times = np.arange(5.0, 6.0, 1 / 30)
     zero = np.zeros((len(times) - 1, 6))
-    base = preintegrate(imu, times, zero, ImuNoise())
+    base = preintegrate(imu, times, zero, IMU)
     h = 1e-5
     for column, step in enumerate(h * np.eye(count)):
         if derivative == 'by_bias':
-            moved = preintegrate(imu, times, zero + step, ImuNoise())
+            moved = preintegrate(imu, times, zero + step, IMU)
         else:
-            moved = preintegrate(imu.corrected(step), times, zero, ImuNoise())
+            moved = preintegrate(imu.corrected(step), times, zero, IMU)
         turn = se3.so3_log(np.swapaxes(base.R, 1, 2) @ moved.R)
         difference = np.concatenate([turn, moved.v - base.v, moved.p - base.p], axis=1) / h
         assert getattr(base, derivative)[:, :, column] == pytest.approx(difference, rel=2e-3, abs=atol)
@@ -129,7 +130,7 @@ def test_derivatives_of_a_preintegration_against_differences(derivative, count, 
 def test_scale_errors_and_misalignments_are_found():
     poses, imu = recording(SCENARIO, 40.0, 1)
     axes = 0.005 * np.random.default_rng(3).normal(size=AXES)
-    result = calibrate_camera_imu(poses[::3], imu.corrected(axes), START_NS, ImuNoise())
+    result = calibrate_camera_imu(poses[::3], imu.corrected(axes), START_NS, IMU)
     # What takes away the errors of the samples: the negative of what was put in, but for its square.
     assert np.all(np.abs(result.axes + axes) < 4.0 * result.axes_sigma + 5e-5)
     # A level flight shows these; that it is level leaves most of the accelerometer's at their prior.
@@ -143,7 +144,7 @@ def test_scale_errors_and_misalignments_are_found():
 def test_errors_that_last_for_seconds_widen_the_claim():
     poses, imu = recording(SCENARIO, 24.0, 2)
     poses = poses[::2]
-    white = calibrate_camera_imu(poses, imu, START_NS, ImuNoise())
+    white = calibrate_camera_imu(poses, imu, START_NS, IMU)
     rng = np.random.default_rng(6)
     # A pose is off by the same for a second at a time, as much as the noise of a single one.
     views = rng.normal(0.0, 1.0, (len(poses) // 15 + 1, 6)) * np.repeat([0.002, 0.0006], 3)
@@ -151,7 +152,7 @@ def test_errors_that_last_for_seconds_widen_the_claim():
     for index, pose in enumerate(poses):
         off, T = views[index // 15], pose.T_map_camera
         biased.append(replace(pose, T_map_camera=se3.transform(se3.so3_exp(off[3:]) @ T[:3, :3], T[:3, 3] + off[:3])))
-    lasting = calibrate_camera_imu(biased, imu, START_NS, ImuNoise())
+    lasting = calibrate_camera_imu(biased, imu, START_NS, IMU)
     assert np.sqrt(np.trace(lasting.covariance[3:6, 3:6]) / np.trace(white.covariance[3:6, 3:6])) > 2.0
     error = error_of(lasting, SCENARIO)
     # Of eight groups the deviation itself is known to a quarter: t of seven degrees of freedom, 99.9 %, for each.
@@ -164,16 +165,16 @@ def test_derivatives_of_the_batch_against_differences():
     stamps = np.array([(pose.stamp_ns - START_NS) * 1e-9 for pose in chosen])
     measured = np.stack([pose.T_map_camera for pose in chosen])
     root = np.tile(np.eye(6), (len(chosen), 1, 1))
-    problem = Problem(stamps, measured, root, imu, ImuNoise())
+    problem = Problem(stamps, measured, root, imu, IMU)
     state = first_state(stamps, measured, imu, GRAVITY)
     state = replace(state, p_body_camera=np.array([0.1, 0.0, -0.05]))
-    increments = preintegrate(imu, stamps + state.offset, state.bias[:-1], ImuNoise())
+    increments = preintegrate(imu, stamps + state.offset, state.bias[:-1], IMU)
     _, pose_own, pose_shared = problem.pose_errors(state)
-    _, first, second, imu_shared = imu_errors(state, increments, ImuNoise())
+    _, first, second, imu_shared = imu_errors(state, increments, IMU)
     count, h = len(chosen), 1e-6
 
     def both(moved):
-        return problem.pose_errors(moved)[0], imu_errors(moved, increments, ImuNoise())[0]
+        return problem.pose_errors(moved)[0], imu_errors(moved, increments, IMU)[0]
 
     def derivative(own, shared):
         ahead, behind = (both(problem.moved(state, sign * own, sign * shared)) for sign in (1.0, -1.0))
@@ -199,7 +200,7 @@ def test_derivatives_of_the_batch_against_differences():
 def test_noiseless_recording_gives_the_extrinsics_back():
     scenario = replace(SCENARIO, imu=NO_NOISE)
     poses, imu = recording(scenario, 20.0, 2, sigma_m=0.0, sigma_rad=0.0)
-    result = calibrate_camera_imu(poses[::3], imu, START_NS, ImuNoise())
+    result = calibrate_camera_imu(poses[::3], imu, START_NS, IMU)
     error = np.abs(error_of(result, scenario))
     # Samples between frames are interpolated: 1e-5 rad, a few hundredths of a millimetre, some microseconds.
     assert np.all(error[:3] < 2e-5)
@@ -213,7 +214,7 @@ def test_noiseless_recording_gives_the_extrinsics_back():
 def test_a_minute_is_enough(seed, every):
     """Of all poses that a camera gives, at night; by day of a quarter of them, which is enough for seed 1 alone."""
     poses, imu = recording(SCENARIO, 60.0, seed)
-    result = calibrate_camera_imu(poses[::every], imu, START_NS, ImuNoise())
+    result = calibrate_camera_imu(poses[::every], imu, START_NS, IMU)
     error = error_of(result, SCENARIO)
     assert np.degrees(np.linalg.norm(error[:3])) < 0.05
     assert np.linalg.norm(error[3:6]) < 0.002
@@ -230,7 +231,7 @@ def test_wrong_poses_hardly_matter():
     for index in rng.choice(len(poses), 10, replace=False).tolist():
         T = poses[index].T_map_camera @ se3.transform(se3.so3_exp([0.0, 0.3, 0.0]), [0.3, 0.0, 0.1])
         poses[index] = replace(poses[index], T_map_camera=T)
-    error = error_of(calibrate_camera_imu(poses, imu, START_NS, ImuNoise()), SCENARIO)
+    error = error_of(calibrate_camera_imu(poses, imu, START_NS, IMU), SCENARIO)
     assert np.degrees(np.linalg.norm(error[:3])) < 0.1
     assert np.linalg.norm(error[3:6]) < 0.004
 
@@ -238,10 +239,10 @@ def test_wrong_poses_hardly_matter():
 def test_unusable_recordings_are_refused():
     poses, imu = recording(SCENARIO, 20.0, 1)
     with pytest.raises(InputError, match='camera poses'):
-        calibrate_camera_imu(poses[:50], imu, START_NS, ImuNoise())
+        calibrate_camera_imu(poses[:50], imu, START_NS, IMU)
     still = [replace(pose, T_map_camera=poses[0].T_map_camera) for pose in poses]
     with pytest.raises(InputError, match='three axes'):
-        calibrate_camera_imu(still, imu, START_NS, ImuNoise())
+        calibrate_camera_imu(still, imu, START_NS, IMU)
 
 
 # --- rolling read-out ---------------------------------------------------------------------------------
@@ -252,7 +253,7 @@ READOUT = 0.016
 def test_noiseless_rolling_recording_gives_the_readout_time_back():
     scenario = replace(SCENARIO, imu=NO_NOISE)
     frames, camera, imu = rolling_recording(scenario, 13.0, 2, READOUT, sigma_px=0.0)
-    result = calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, ImuNoise())
+    result = calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, IMU)
     error = np.abs(error_of(result, scenario))
     # As without a read-out: samples are interpolated. A microsecond at 1000 px/s is 0.001 px.
     assert abs(result.readout_time - READOUT) < 1e-6
@@ -264,7 +265,7 @@ def test_noiseless_rolling_recording_gives_the_readout_time_back():
 @pytest.mark.parametrize('readout', [0.0, READOUT])
 def test_readout_time_and_extrinsics_within_their_errors(readout):
     frames, camera, imu = rolling_recording(SCENARIO, 15.0, 1, readout, sigma_px=0.1)
-    result = calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, ImuNoise())
+    result = calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, IMU)
     assert 1e-5 < result.readout_sigma < 1e-4
     # Four standard deviations; exactly zero where it is not clearly more.
     assert abs(result.readout_time - readout) < 4.0 * result.readout_sigma
@@ -280,7 +281,7 @@ def test_stamps_that_jitter_and_an_imu_that_shakes_are_allowed_for():
     shaking = replace(SCENARIO.imu, gyroscope_rattle=0.015, accelerometer_rattle=0.3)
     rough = replace(SCENARIO, stamp_jitter=0.002, imu=shaking, vibration=Vibration())
     frames, camera, imu = rolling_recording(rough, 15.0, 3, READOUT, sigma_px=0.1)
-    result = calibrate_rolling_camera_imu(frames[::2], camera, imu, START_NS, ImuNoise())
+    result = calibrate_rolling_camera_imu(frames[::2], camera, imu, START_NS, IMU)
     # Most exponential stamps are nearer to their mean than normal ones: the median says 0.94 of the deviation; and the
     # states of an IMU that shakes follow part of what is left.
     assert 0.0012 < result.stamp_jitter < 0.0022
@@ -305,7 +306,7 @@ def test_white_noise_is_estimated_from_the_samples():
 def test_samples_may_shake_by_more_than_any_imu_has_at_rest():
     shaking = replace(SCENARIO.imu, gyroscope_rattle=3.0, accelerometer_rattle=30.0)
     _, imu = recording(replace(SCENARIO, imu=shaking), 20.0, 1)
-    noise = imu.noise(ImuNoise())
+    noise = imu.noise(IMU)
     # As above.
     assert noise.gyroscope_noise_density == pytest.approx(3.0 / np.sqrt(200.0), rel=0.05)
     assert noise.accelerometer_noise_density == pytest.approx(30.0 / np.sqrt(200.0), rel=0.05)
@@ -313,6 +314,6 @@ def test_samples_may_shake_by_more_than_any_imu_has_at_rest():
 
 def test_poses_alone_say_nothing_of_the_readout_time():
     poses, imu = recording(SCENARIO, 20.0, 1)
-    result = calibrate_camera_imu(poses[::3], imu, START_NS, ImuNoise())
+    result = calibrate_camera_imu(poses[::3], imu, START_NS, IMU)
     assert result.readout_time == 0.0
     assert np.isinf(result.readout_sigma)

@@ -40,8 +40,8 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 _DIVISORS = np.arange(6.0, 1.0, -1.0)[:, None, None, None]
 _IDENTITY = np.eye(9)
 #: Longest time of coasting that is looked ahead [s], and its resolution [s]. A time of hover is divided into so many
-#: steps: the exponential is exact for any, and of the variance by white noise 1 % is missing.
-HORIZON, _TICK, _STEPS = 60.0, 0.05, 5
+#: steps: the exponential is exact for any, and of the variance by white noise and walks 1 % is missing.
+HORIZON, _TICK, _STEPS = 60.0, 0.05, 10
 
 
 def _generators() -> FloatArray:
