@@ -10,6 +10,7 @@ from support.flights import (
     config,
     errors,
     Flight,
+    IMU,
     matched,
     Motion,
     perfect,
@@ -114,7 +115,7 @@ def test_error_beside_the_bounds(benchmark, write_table):
 GAP_BEGIN, GAPS = 7.0, (1.0, 2.0, 5.0)
 GOALS = ('4 cm', '10 cm', '50 cm')
 #: That of a cheap IMU, ten times the default; and one without scale errors and nonlinearity.
-COASTING_IMU = ImuNoise(accelerometer_noise_density=2e-2)
+COASTING_IMU = replace(IMU, accelerometer_noise_density=2e-2)
 CALIBRATED_IMU = perfect(COASTING_IMU)
 
 
@@ -217,7 +218,7 @@ def clock_error(seed, imu_noise, declared):
 
 def false_steps(seed):
     """How often a minute of flight looks like a step of the camera's clock, which there is not."""
-    data = gentle(seed, ImuNoise(), 60.0, imu_rate=100.0)
+    data = gentle(seed, IMU, 60.0, imu_rate=100.0)
     rng, ekf = np.random.default_rng(seed), PoseEkf(white_poses())
     later = LATER * rng.uniform(size=len(data.poses)) * (rng.uniform(size=len(data.poses)) < LATE_SHARE)
     steps, before = 0, None
@@ -234,12 +235,12 @@ def false_steps(seed):
 
 def test_clock_offset(benchmark, write_table):
     """Prior of 30 ms, poses late by 30 ms: the offset's error beside its claim after 5 s, and steps that are none."""
-    benchmark.pedantic(clock_error, args=(0, ImuNoise(), True), rounds=1)
+    benchmark.pedantic(clock_error, args=(0, IMU, True), rounds=1)
     rows = [['gyroscope, accelerometer', 'errors of the rig', 'error, rms', 'claimed', 'error over claim, rms']]
     shares = {True: [], False: []}
     for declared, words in ((True, 'as declared'), (False, 'none')):
         for densities in GRADES:
-            noise = ImuNoise(gyroscope_noise_density=densities[0], accelerometer_noise_density=densities[1])
+            noise = replace(IMU, gyroscope_noise_density=densities[0], accelerometer_noise_density=densities[1])
             error, claim = np.array([clock_error(seed, noise, declared) for seed in CLOCK_SEEDS]).T
             shares[declared].append(rms(error / claim))
             grade = f'{densities[0]:g} rad/s/√Hz, {densities[1]:g} m/s²/√Hz'
