@@ -73,7 +73,7 @@ MECHANISMS = {
     ),
     'joint weights of surveyed markers': Mechanism(
         ('uneven map', 'surveyed board'),
-        ('localization:_of_survey',),
+        ('localization:_SurveyedFit', 'localization:_inverse', 'localization:_corner_blocks'),
         {'mapper:locate': _placed_together},
     ),
     'alternative pose': Mechanism(

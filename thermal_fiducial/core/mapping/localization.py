@@ -38,7 +38,7 @@ WIDE = np.deg2rad(25.0)
 _PROPOSERS = 4
 # Gauss-Newton steps with the joint weights of surveyed markers, after the first: more of them change no figure by a
 # hundredth, one alone leaves some a hundredth worse.
-_STEPS_IN_SURVEY = 2
+_MORE_STEPS = 2
 # Standard deviation of a rotation beyond which nothing is known of it, and its linearisation means nothing [rad].
 _NOTHING_KNOWN = 1.0
 
@@ -62,7 +62,8 @@ def locate(
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
     hypotheses = hypotheses[np.argsort(fit.costs(hypotheses), kind='stable')]
-    frame = _JointFit(stamp_ns, sight, camera, model, fit)
+    kind = _SurveyedFit if sight.surveyed.any() else _JointFit
+    frame = kind(stamp_ns, sight, camera, model, fit)
     # Steps 3 and 4: the pose from all markers jointly, weighted by the map.
     by_map = frame.map_weights(hypotheses[0])
     T = fit.solve(hypotheses[:1], by_map)[0][0]
@@ -107,56 +108,33 @@ class _JointFit:
     fit: CameraFit
 
     def weights(self, seen: Reprojected, by_map: FloatArray) -> FloatArray:
-        """Weights (N,) of the markers by their errors, and ``by_map`` (N,) of those that were not surveyed."""
-        sight = self.sight
-        of_survey = np.diagonal(_of_survey(sight, seen), axis1=1, axis2=2).mean(axis=1)
-        by_errors = marker_weights(seen.errors_px, np.sqrt(sight.noise_px**2 + of_survey), self.model)
-        return np.asarray(np.where(sight.surveyed, 1.0, by_map) * by_errors)
+        """Weights (N,) of the markers ``by_map`` (N,) and by their errors."""
+        return np.asarray(by_map * marker_weights(seen.errors_px, self.sight.noise_px, self.model))
 
     def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
-        """Gauss-Newton step from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
+        """One Gauss-Newton step from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
 
-        With surveyed markers more steps: their corners have joint weights here, which move the solution. The last
-        linearisation, in corners, map and scale, gives the covariances. None if the markers do not determine the pose.
+        The same linearisation, in corners, map and scale, gives the covariances. None if the markers do not determine
+        the pose.
         """
-        found = self._stepped(T_map_camera, seen, weights)
-        for _ in range(_STEPS_IN_SURVEY if self.sight.surveyed.any() else 0):
-            if found is None:
-                return None
-            T_map_camera = found.pose.T_map_camera
-            found = self._stepped(T_map_camera, self.sight.reprojected(self.camera, T_map_camera), weights)
-        return found
-
-    def _stepped(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
-        """The location after one Gauss-Newton step; None if that is not determined."""
-        n, residuals = len(weights), seen.residuals
-        if not np.all(np.isfinite(residuals)):
-            return None
-        information, chi2 = self._information(seen, weights)
-        J = seen.J_camera.reshape(8 * n, 6)
-        weighted = (information @ seen.J_camera).reshape(8 * n, 6)
+        n, J = len(weights), seen.J_camera.reshape(-1, 6)
+        weighted, chi2 = self._weighted(seen, weights)
         try:
             gains = np.linalg.inv(J.T @ weighted) @ weighted.T
         except np.linalg.LinAlgError:
             return None
-        step = gains @ residuals.ravel()
-        after = replace(seen, residuals=residuals - (J @ step).reshape(n, 4, 2))
+        step = gains @ seen.residuals.ravel()
+        after = replace(seen, residuals=seen.residuals - (J @ step).reshape(n, 4, 2))
         return self._location(T_map_camera, step, gains, chi2, after, weights)
 
-    def _information(self, seen: Reprojected, weights: FloatArray) -> tuple[FloatArray, float]:
-        """Robust information (N, 8, 8) of the markers' corners [1/px^2], and chi square of their residuals.
-
-        A corner is an outlier by what the others of its marker leave of it: errors of a survey move them together.
-        """
-        sight, residuals = self.sight, seen.residuals.reshape(-1, 8, 1)
-        of_survey = survey_for_weights(_of_survey(sight, seen), sight.noise_px, self.model)
-        information = weights[:, None, None] * _inverse(of_survey, sight.observed.covariances)
-        weighted = information @ residuals
-        pulls, of_each = weighted.reshape(-1, 4, 2, 1), _corner_blocks(information)
-        squared = (pulls * (inverse_2x2(of_each) @ pulls)).sum(axis=(-2, -1))
-        excess = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
-        robust = weights[:, None, None] * _inverse(of_survey, sight.observed.covariances * excess)
-        return robust, float((residuals * weighted).sum())
+    def _weighted(self, seen: Reprojected, weights: FloatArray) -> tuple[FloatArray, float]:
+        """The Jacobian (8 N, 6) times the robust information of the corners, and chi square of their residuals."""
+        n, residuals = len(weights), seen.residuals[..., None]
+        information = inverse_2x2(self.sight.observed.covariances) * weights[:, None, None, None]
+        squared = (residuals * (information @ residuals)).sum(axis=(-2, -1))
+        robust = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
+        weighted = information / robust @ seen.J_camera.reshape(n, 4, 2, 6)
+        return np.asarray(weighted.reshape(8 * n, 6)), float(squared.sum())
 
     def _location(
         self,
@@ -209,8 +187,7 @@ class _JointFit:
         apart = rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE
         if not np.any(apart):
             return None
-        by_map = np.where(self.sight.surveyed, self.map_weights(T), 1.0)
-        weights = by_map * found.weights * decision_weights(self.sight.noise_px, self.model)
+        weights = found.weights * decision_weights(self.sight.noise_px, self.model)
         starts = np.stack([T, hypotheses[apart][0]])
         (T, other), chi2, _ = self.fit.solve(starts, weights, inlier=np.inf)
         refuted = chi2[1] - chi2[0] > DECISIVE * noise_factor(float(chi2[0]), 8 * len(weights) - 6)
@@ -228,6 +205,65 @@ class _JointFit:
         return map_weights(sight.noise_px, self.camera.focal_px * np.sqrt(apart) / distances, self.model)
 
 
+class _SurveyedFit(_JointFit):
+    """The fit of a frame with surveyed markers, of which the error of each moves its corners together.
+
+    With corners that count as independent, an error of the distance between two markers tilts the camera.
+    """
+
+    def weights(self, seen: Reprojected, by_map: FloatArray) -> FloatArray:
+        """As of any fit, but errors of the survey are expected, and have joint weights."""
+        sight = self.sight
+        of_survey = np.diagonal(self._of_survey(seen), axis1=1, axis2=2).mean(axis=1)
+        by_errors = marker_weights(seen.errors_px, np.sqrt(sight.noise_px**2 + of_survey), self.model)
+        return np.asarray(np.where(sight.surveyed, 1.0, by_map) * by_errors)
+
+    def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
+        """As of any fit, with more steps: joint weights move the solution."""
+        found = super().refined(T_map_camera, seen, weights)
+        for _ in range(_MORE_STEPS):
+            if found is None:
+                return None
+            T_map_camera = found.pose.T_map_camera
+            seen = self.sight.reprojected(self.camera, T_map_camera)
+            found = super().refined(T_map_camera, seen, weights) if np.all(np.isfinite(seen.residuals)) else None
+        return found
+
+    def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
+        """As of any fit; it compares corners that count as independent."""
+        by_map = np.where(self.sight.surveyed, self.map_weights(found.pose.T_map_camera), 1.0)
+        return super().alternative(replace(found, weights=by_map * found.weights), hypotheses)
+
+    def _weighted(self, seen: Reprojected, weights: FloatArray) -> tuple[FloatArray, float]:
+        """As of any fit; a corner is an outlier by what the others of its marker leave of it."""
+        residuals, of_corners = seen.residuals.reshape(-1, 8, 1), self.sight.observed.covariances
+        of_survey = survey_for_weights(self._of_survey(seen), self.sight.noise_px, self.model)
+        information = weights[:, None, None] * _inverse(of_survey, of_corners)
+        weighted = information @ residuals
+        pulls, of_each = weighted.reshape(-1, 4, 2, 1), _corner_blocks(information)
+        squared = (pulls * (inverse_2x2(of_each) @ pulls)).sum(axis=(-2, -1))
+        excess = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
+        robust = weights[:, None, None] * _inverse(of_survey, of_corners * excess)
+        return np.asarray((robust @ seen.J_camera).reshape(-1, 6)), float((residuals * weighted).sum())
+
+    def _of_survey(self, seen: Reprojected) -> FloatArray:
+        """Covariances (N, 8, 8) [px^2] of the corners by errors of the survey: zero of the other markers."""
+        J = np.where(self.sight.surveyed[:, None, None], seen.J_marker, 0.0)
+        return np.asarray(J @ self.sight.map_covariances @ J.swapaxes(-1, -2))
+
+
+def _inverse(of_survey: FloatArray, of_corners: FloatArray) -> FloatArray:
+    """Inverses (N, 8, 8) of the sums of joint covariances (N, 8, 8) and those of each corner (N, 4, 2, 2)."""
+    covariances = of_survey.copy()
+    _corner_blocks(covariances)[...] += of_corners
+    return np.asarray(np.linalg.inv(covariances))
+
+
+def _corner_blocks(matrices: FloatArray) -> FloatArray:
+    """The blocks (N, 4, 2, 2) on the diagonals of (N, 8, 8): a view."""
+    return np.asarray(np.einsum('nkikj->nkij', matrices.reshape(-1, 4, 2, 4, 2)))
+
+
 def marker_weights(errors_px: FloatArray, noise_px: FloatArray, model: SystematicErrors) -> FloatArray:
     """Step 5 of Algorithm 1: weights (N,) of markers by their re-projection errors, rms [px].
 
@@ -240,28 +276,6 @@ def marker_weights(errors_px: FloatArray, noise_px: FloatArray, model: Systemati
     """
     expected = 2.0 * (noise_px**2 + model.corner_px**2)
     return np.asarray(np.minimum(1.0, expected / np.maximum(errors_px**2, TINY)))
-
-
-def _of_survey(sight: Sight, seen: Reprojected) -> FloatArray:
-    """Covariances (N, 8, 8) [px^2] of the corners by errors of the survey: zero of markers that were not surveyed."""
-    J = np.where(sight.surveyed[:, None, None], seen.J_marker, 0.0)
-    return np.asarray(J @ sight.map_covariances @ J.swapaxes(-1, -2))
-
-
-def _inverse(of_survey: FloatArray, of_corners: FloatArray) -> FloatArray:
-    """Inverses (N, 8, 8) of the sums of joint covariances (N, 8, 8) and those of each corner (N, 4, 2, 2)."""
-    if of_survey.any():
-        covariances = of_survey.copy()
-        _corner_blocks(covariances)[...] += of_corners
-        return np.asarray(np.linalg.inv(covariances))
-    information = np.zeros_like(of_survey)
-    _corner_blocks(information)[...] = inverse_2x2(of_corners)
-    return information
-
-
-def _corner_blocks(matrices: FloatArray) -> FloatArray:
-    """The blocks (N, 4, 2, 2) on the diagonals of (N, 8, 8): a view."""
-    return np.asarray(np.einsum('nkikj->nkij', matrices.reshape(-1, 4, 2, 4, 2)))
 
 
 def _hypotheses(sight: Sight, prior: FloatArray | None) -> FloatArray:
