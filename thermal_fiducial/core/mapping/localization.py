@@ -91,7 +91,9 @@ def _either(frame: '_JointFit', found: Location, T_other: FloatArray, prior: Flo
     if other is None or other.rotation_std > _NOTHING_KNOWN:
         return found
     if prior is None:
-        both = Viewpoint.either(found.viewpoint, other.viewpoint)
+        chi2 = frame.fit.costs(np.stack([T, other.pose.T_map_camera]))
+        chi2 *= decision_weights(frame.sight.noise_px, frame.model).min()
+        both = Viewpoint.either(found.viewpoint, other.viewpoint, chi2)
         return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both)
     turns = rotation_angle(prior[:3, :3].T @ np.stack([T, T_other])[:, :3, :3])
     return other if turns[1] < turns[0] else found

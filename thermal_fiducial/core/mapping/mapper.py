@@ -160,7 +160,8 @@ class MarkerMapper:
             # Probably a moved or duplicated marker: an update would corrupt the map.
             waiting = dict.fromkeys(frame.new.ids.tolist(), CONTRADICTED)
         else:
-            self._last, updated = outcome.pose, True
+            # A pose that is too uncertain to be published settles no ambiguity.
+            self._last, updated = frame.pose or self._last, True
             # Step 7: errors updated.
             self._bias.add(outcome)
             known, (errors, error_stds) = frame.known.markers, frame.known_errors(outcome)

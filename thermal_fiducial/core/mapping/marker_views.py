@@ -42,6 +42,8 @@ class Viewpoint:
     draws: FloatArray
     #: (6, 2) displacements of the camera by one standard deviation of the scales, of map and lens
     scales: FloatArray
+    #: (2,) of the known markers' residuals from either: how likely it is
+    chi2: FloatArray
 
     @property
     def poses(self) -> FloatArray:
@@ -53,16 +55,17 @@ class Viewpoint:
         cls, T_map_camera: FloatArray, covariance: FloatArray, draws: FloatArray, scales: FloatArray = NO_SCALES
     ) -> 'Viewpoint':
         """A unique camera pose (4, 4): covariance (6, 6) of its own error, draws (6, K) of the one that views share."""
-        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2), np.stack([draws] * 2), scales)
+        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2), np.stack([draws] * 2), scales, np.zeros(2))
 
     @classmethod
-    def either(cls, first: 'Viewpoint', second: 'Viewpoint') -> 'Viewpoint':
-        """One of two known camera poses."""
+    def either(cls, first: 'Viewpoint', second: 'Viewpoint', chi2: FloatArray) -> 'Viewpoint':
+        """One of two known camera poses, of which the known markers leave residuals of ``chi2`` (2,)."""
         return cls(
             np.stack([first.T_map_camera[0], second.T_map_camera[0]]),
             np.stack([first.covariances[0], second.covariances[0]]),
             np.stack([first.draws[0], second.draws[0]]),
             first.scales,
+            chi2,
         )
 
 
@@ -144,6 +147,7 @@ class MarkerViews:
         best = np.argmin(np.sum(np.square(self._draws[:, 0]), axis=(1, 2)))
         self._covariances = self._camera_noise + covariance_of(self._draws - self._draws[best, 0])
         self._doubtful = any(len(view.viewpoint.poses) > 1 for view in views)
+        self._chi2_of_cameras = np.stack([view.viewpoint.chi2 for view in views])
 
     def fit(self, starts: FloatArray) -> FittedPoses:
         """Fits from all initial poses (S, 4, 4); of two possible camera poses the likelier one is used."""
@@ -154,7 +158,7 @@ class MarkerViews:
             used, chosen = chosen, self._choose(T)
             if np.array_equal(used, chosen):
                 break
-        cost = chi2 + np.sum(begun.log_determinants, axis=-1)
+        cost = chi2 + np.sum(begun.log_determinants, axis=-1) + np.sum(self._cameras(used)[2], axis=-1)
         order = np.argsort(cost, kind='stable')
         best = order[0]
         return FittedPoses(T[order], chi2[order], cost[order], used[best], begun.W[best])
@@ -186,10 +190,10 @@ class MarkerViews:
         costs = [self._weights(T, choice).costs for choice in (first, first + 1)]
         return np.asarray(np.argmin(np.where(np.isfinite(costs), costs, np.inf), axis=0))
 
-    def _cameras(self, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
-        """The chosen (S, n) of each camera's poses (S, n, 4, 4), and their covariances (S, n, 6, 6)."""
+    def _cameras(self, chosen: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The chosen (S, n) of each camera's poses (S, n, 4, 4), covariances (S, n, 6, 6) and chi squares (S, n)."""
         views = np.arange(chosen.shape[1])
-        return self._T_map_camera[views, chosen], self._covariances[views, chosen]
+        return self._T_map_camera[views, chosen], self._covariances[views, chosen], self._chi2_of_cameras[views, chosen]
 
     def _linearised(self, T: FloatArray, T_map_camera: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Residuals (S, n, 8) [px] of markers at T, and derivatives (S, n, 8, 6) by the cameras and by the marker."""
@@ -205,7 +209,7 @@ class MarkerViews:
         A residual comes of the corners' noise, of the systematic part, and of the camera's own pose, which moves all
         four corners together. What cannot be, a corner in the plane of the camera, has an infinite determinant.
         """
-        T_map_camera, covariances = self._cameras(chosen)
+        T_map_camera, covariances, of_cameras = self._cameras(chosen)
         r, J_camera, _ = self._linearised(T, T_map_camera)
         possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(-1, -2))
         J_sound = np.where(possible[..., None, None], J_camera, 0.0)
@@ -215,11 +219,11 @@ class MarkerViews:
         log_determinants = np.where(possible, log_determinants, np.inf)
         W = np.linalg.inv(L)
         r = W @ r[..., None]
-        return _Weights(W, log_determinants, np.sum(r * r, axis=(-1, -2)) + log_determinants)
+        return _Weights(W, log_determinants, np.sum(r * r, axis=(-1, -2)) + log_determinants + of_cameras)
 
     def _minimised(self, T: FloatArray, chosen: IntArray, begun: _Weights) -> tuple[FloatArray, FloatArray]:
         """Poses (S, 4, 4) from starts, and their chi squares (S,), inf where there is none."""
-        T_map_camera, _ = self._cameras(chosen)
+        T_map_camera, _, _ = self._cameras(chosen)
 
         def evaluated(T: FloatArray) -> Evaluation:
             r, _, J = self._linearised(T, T_map_camera)

@@ -106,6 +106,25 @@ def test_a_new_marker_has_the_errors_of_the_lens_at_its_own_corners():
 
 def test_one_of_two_cameras_has_the_draws_of_each():
     first, second = (seen_from(x, x * np.ones((6, DRAWS))).viewpoint for x in (0.1, 0.2))
-    both = Viewpoint.either(first, second)
+    both = Viewpoint.either(first, second, np.zeros(2))
     assert len(both.poses) == 2
     assert np.array_equal(both.draws[:, 0, 0], [0.1, 0.2])
+
+
+def placed_by_either(chi2):
+    """Exact views from cameras that may as well all be turned by half a radian, with the map; ``chi2`` of the two."""
+    turn, candidate = transform(so3_exp([0.0, 0.0, 0.5]), np.zeros(3)), Candidate(7, SIZE)
+    for x in (-0.3, 0.0, 0.3):
+        view = seen_from(x, np.zeros((6, DRAWS)))
+        turned = replace(view.viewpoint, T_map_camera=turn @ view.viewpoint.T_map_camera)
+        candidate.add(replace(view, viewpoint=Viewpoint.either(view.viewpoint, turned, np.array(chi2))))
+    return candidate.place(CAMERA, SystematicErrors(corner_px=0.0))
+
+
+@pytest.mark.parametrize(('chi2', 'sign'), [((0.0, 15.0), 1.0), ((15.0, 0.0), -1.0)])
+def test_of_two_cameras_that_place_a_marker_equally_well_the_likelier_one_counts(chi2, sign):
+    known = placed(*[np.zeros((6, DRAWS))] * 3).T_map_marker
+    there = transform(so3_exp([0.0, 0.0, 0.5 * (sign < 0.0)]), np.zeros(3)) @ known
+    # Exact views, to where a step is negligible.
+    assert np.allclose(placed_by_either(chi2).T_map_marker, there, rtol=0.0, atol=1e-6)
+    assert 'unsettled' in placed_by_either((0.0, 0.0))
