@@ -73,7 +73,7 @@ MECHANISMS = {
     ),
     'joint weights of surveyed markers': Mechanism(
         ('uneven map', 'surveyed board'),
-        ('localization:_SurveyedFit', 'localization:_inverse', 'localization:_corner_blocks'),
+        ('localization:_SurveyedFit',),
         {'mapper:locate': _placed_together},
     ),
     'alternative pose': Mechanism(

@@ -63,14 +63,13 @@ def noise_text(fit: 'ImuNoiseFit') -> str:
         '  ros__parameters:',
         '    imu:',
     ]
-    for name, values in (
-        ('gyroscope_noise_density', fit.gyroscope.white),
-        ('accelerometer_noise_density', fit.accelerometer.white),
-        ('gyroscope_random_walk', fit.gyroscope.walk),
-        ('accelerometer_random_walk', fit.accelerometer.walk),
+    for name, values, least in (
+        ('gyroscope_noise_density', fit.gyroscope.white, 0.0),
+        ('accelerometer_noise_density', fit.accelerometer.white, 0.0),
+        ('gyroscope_random_walk', fit.gyroscope.walk, usual.gyroscope_random_walk),
+        ('accelerometer_random_walk', fit.accelerometer.walk, usual.accelerometer_random_walk),
     ):
         axes, found = ', '.join(f'{value:.2e}' for value in values), _rms(values)
-        least = getattr(usual, name) if name.endswith('walk') else 0.0
         remark = '' if found >= least else f'in flight; at rest {found:.1e} '
         lines.append(f'      {name}: {max(found, least):.4e}  # {remark}({axes})')
     for name, sensor in (('gyroscope', fit.gyroscope), ('accelerometer', fit.accelerometer)):

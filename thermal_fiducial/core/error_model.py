@@ -247,6 +247,18 @@ def drawn_sum(gains: FloatArray, draws: FloatArray) -> FloatArray:
     return np.asarray(np.tensordot(gains, draws, axes=([0, 2], [0, 1])))
 
 
+def of_independent_corners(covariances: FloatArray) -> FloatArray:
+    """Covariances (N, 8, 8) of the corners of N markers by those of each corner (N, 4, 2, 2)."""
+    whole = np.zeros((len(covariances), 8, 8))
+    of_each_corner(whole)[...] = covariances
+    return whole
+
+
+def of_each_corner(matrices: FloatArray) -> FloatArray:
+    """The blocks (N, 4, 2, 2) on the diagonals of (N, 8, 8): a view."""
+    return np.asarray(np.einsum('nkikj->nkij', matrices.reshape(-1, 4, 2, 4, 2)))
+
+
 def covariance_of(draws: FloatArray) -> FloatArray:
     """Covariances (..., m, m) of draws (..., m, K) of errors whose mean is zero."""
     return np.asarray(draws @ np.swapaxes(draws, -1, -2) / draws.shape[-1])

@@ -16,6 +16,8 @@ from thermal_fiducial.core.error_model import (
     map_weights,
     noise_factor,
     noise_of_pose,
+    of_each_corner,
+    of_independent_corners,
     of_single_error,
     survey_for_weights,
     SystematicErrors,
@@ -240,30 +242,18 @@ class _SurveyedFit(_JointFit):
         """As of any fit; a corner is an outlier by what the others of its marker leave of it."""
         residuals, of_corners = seen.residuals.reshape(-1, 8, 1), self.sight.observed.covariances
         of_survey = survey_for_weights(self._of_survey(seen), self.sight.noise_px, self.model)
-        information = weights[:, None, None] * _inverse(of_survey, of_corners)
+        information = weights[:, None, None] * np.linalg.inv(of_survey + of_independent_corners(of_corners))
         weighted = information @ residuals
-        pulls, of_each = weighted.reshape(-1, 4, 2, 1), _corner_blocks(information)
+        pulls, of_each = weighted.reshape(-1, 4, 2, 1), of_each_corner(information)
         squared = (pulls * (inverse_2x2(of_each) @ pulls)).sum(axis=(-2, -1))
         excess = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
-        robust = weights[:, None, None] * _inverse(of_survey, of_corners * excess)
+        robust = weights[:, None, None] * np.linalg.inv(of_survey + of_independent_corners(of_corners * excess))
         return np.asarray((robust @ seen.J_camera).reshape(-1, 6)), float((residuals * weighted).sum())
 
     def _of_survey(self, seen: Reprojected) -> FloatArray:
         """Covariances (N, 8, 8) [px^2] of the corners by errors of the survey: zero of the other markers."""
         J = np.where(self.sight.surveyed[:, None, None], seen.J_marker, 0.0)
         return np.asarray(J @ self.sight.map_covariances @ J.swapaxes(-1, -2))
-
-
-def _inverse(of_survey: FloatArray, of_corners: FloatArray) -> FloatArray:
-    """Inverses (N, 8, 8) of the sums of joint covariances (N, 8, 8) and those of each corner (N, 4, 2, 2)."""
-    covariances = of_survey.copy()
-    _corner_blocks(covariances)[...] += of_corners
-    return np.asarray(np.linalg.inv(covariances))
-
-
-def _corner_blocks(matrices: FloatArray) -> FloatArray:
-    """The blocks (N, 4, 2, 2) on the diagonals of (N, 8, 8): a view."""
-    return np.asarray(np.einsum('nkikj->nkij', matrices.reshape(-1, 4, 2, 4, 2)))
 
 
 def marker_weights(errors_px: FloatArray, noise_px: FloatArray, model: SystematicErrors) -> FloatArray:

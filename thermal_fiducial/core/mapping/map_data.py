@@ -98,8 +98,13 @@ class MarkerMap:
         for marker_id, marker in adjusted.items():
             own = self.markers.get(marker_id)
             if own is not None and own.trusted:
-                geometry = {name: getattr(marker, name) for name in ('T_map_marker', 'covariance', 'draws', 'surveyed')}
-                self.markers[marker_id] = replace(own, **geometry)
+                self.markers[marker_id] = replace(
+                    own,
+                    T_map_marker=marker.T_map_marker,
+                    covariance=marker.covariance,
+                    draws=marker.draws,
+                    surveyed=marker.surveyed,
+                )
         self.revision += 1
 
     def with_assumed_draws(self, errors: SystematicErrors) -> 'MarkerMap':

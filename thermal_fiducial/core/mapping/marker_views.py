@@ -11,6 +11,7 @@ from thermal_fiducial.core.error_model import (
     drawn_sum,
     DRAWS,
     independent_sum,
+    of_independent_corners,
     SystematicErrors,
     with_corner_errors,
 )
@@ -121,9 +122,10 @@ class FittedPoses:
 class _Weights:
     """Weights of n views of S markers, as decided from where the markers and their cameras were taken to be."""
 
-    #: (S, n, 8, 8) by which residuals become unit white, and the logarithms (S, n) of their covariances' determinants
+    #: (S, n, 8, 8) by which residuals become unit white
     W: FloatArray
-    log_determinants: FloatArray
+    #: (S, n) part of the costs beside the residuals': log-determinants of their covariances, chi squares of the cameras
+    constants: FloatArray
     #: (S, n) minus twice the logarithm of each view's likelihood there
     costs: FloatArray
 
@@ -136,9 +138,9 @@ class MarkerViews:
         corners = np.stack([view.corners for view in views])
         self._corners, self._of_lens = corners.reshape(-1, 8), LensErrors(corners, camera, errors)
         covariances = np.stack([view.corner_covariances for view in views])
-        self._noise = _of_views(covariances)
+        self._noise = of_independent_corners(covariances)
         #: with the bias of the corners, for weights and decisions
-        self._uncertain = _of_views(with_corner_errors(covariances, SystematicErrors()))
+        self._uncertain = of_independent_corners(with_corner_errors(covariances, SystematicErrors()))
         self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
         self._camera_noise = np.stack([view.viewpoint.covariances for view in views])
         self._scales = np.stack([view.viewpoint.scales for view in views])
@@ -158,7 +160,7 @@ class MarkerViews:
             used, chosen = chosen, self._choose(T)
             if np.array_equal(used, chosen):
                 break
-        cost = chi2 + np.sum(begun.log_determinants, axis=-1) + np.sum(self._cameras(used)[2], axis=-1)
+        cost = chi2 + np.sum(begun.constants, axis=-1)
         order = np.argsort(cost, kind='stable')
         best = order[0]
         return FittedPoses(T[order], chi2[order], cost[order], used[best], begun.W[best])
@@ -190,11 +192,6 @@ class MarkerViews:
         costs = [self._weights(T, choice).costs for choice in (first, first + 1)]
         return np.asarray(np.argmin(np.where(np.isfinite(costs), costs, np.inf), axis=0))
 
-    def _cameras(self, chosen: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The chosen (S, n) of each camera's poses (S, n, 4, 4), covariances (S, n, 6, 6) and chi squares (S, n)."""
-        views = np.arange(chosen.shape[1])
-        return self._T_map_camera[views, chosen], self._covariances[views, chosen], self._chi2_of_cameras[views, chosen]
-
     def _linearised(self, T: FloatArray, T_map_camera: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Residuals (S, n, 8) [px] of markers at T, and derivatives (S, n, 8, 6) by the cameras and by the marker."""
         shape = *T_map_camera.shape[:2], 8
@@ -209,21 +206,21 @@ class MarkerViews:
         A residual comes of the corners' noise, of the systematic part, and of the camera's own pose, which moves all
         four corners together. What cannot be, a corner in the plane of the camera, has an infinite determinant.
         """
-        T_map_camera, covariances, of_cameras = self._cameras(chosen)
-        r, J_camera, _ = self._linearised(T, T_map_camera)
+        own = np.arange(chosen.shape[1]), chosen
+        r, J_camera, _ = self._linearised(T, self._T_map_camera[own])
         possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(-1, -2))
         J_sound = np.where(possible[..., None, None], J_camera, 0.0)
-        C = J_sound @ covariances @ np.swapaxes(J_sound, -1, -2) + self._uncertain
+        C = J_sound @ self._covariances[own] @ np.swapaxes(J_sound, -1, -2) + self._uncertain
         L = np.linalg.cholesky(C)
         log_determinants = 2.0 * np.sum(np.log(np.einsum('...ii->...i', L)), axis=-1)
-        log_determinants = np.where(possible, log_determinants, np.inf)
+        constants = np.where(possible, log_determinants, np.inf) + self._chi2_of_cameras[own]
         W = np.linalg.inv(L)
         r = W @ r[..., None]
-        return _Weights(W, log_determinants, np.sum(r * r, axis=(-1, -2)) + log_determinants + of_cameras)
+        return _Weights(W, constants, np.sum(r * r, axis=(-1, -2)) + constants)
 
     def _minimised(self, T: FloatArray, chosen: IntArray, begun: _Weights) -> tuple[FloatArray, FloatArray]:
         """Poses (S, 4, 4) from starts, and their chi squares (S,), inf where there is none."""
-        T_map_camera, _, _ = self._cameras(chosen)
+        T_map_camera = self._T_map_camera[np.arange(chosen.shape[1]), chosen]
 
         def evaluated(T: FloatArray) -> Evaluation:
             r, _, J = self._linearised(T, T_map_camera)
@@ -232,14 +229,6 @@ class MarkerViews:
             # Residuals are measured minus predicted: the gradient is that of their squares.
             return np.where(np.isfinite(chi2), chi2, np.inf), -(J_transposed @ r)[..., 0], J_transposed @ J
 
-        possible = np.all(np.isfinite(begun.log_determinants), axis=-1)
+        possible = np.all(np.isfinite(begun.constants), axis=-1)
         T, chi2, _ = minimise(T, evaluated, alternatives=len(T))
         return T, np.where(possible, chi2, np.inf)
-
-
-def _of_views(covariances: FloatArray) -> FloatArray:
-    """Covariances (n, 8, 8) of all corners of n views by those of single corners (n, 4, 2, 2)."""
-    whole = np.zeros((len(covariances), 4, 2, 4, 2))
-    each = np.arange(4)
-    whole[:, each, :, each] = np.swapaxes(covariances, 0, 1)
-    return whole.reshape(-1, 8, 8)
