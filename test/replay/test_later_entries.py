@@ -68,6 +68,12 @@ def test_the_same_poses_as_from_images(folder, entry, transport):
         assert summary['messages_out']['pose'] > enough
 
 
+@pytest.mark.parametrize('words', [('images', '--from', 'markers'), ('markers',)])
+def test_images_cannot_be_recorded_where_no_node_has_them(folder, words, capfd):
+    assert replay(folder, *words, '--images') == 2
+    assert '--images has no effect with input from' in capfd.readouterr().err
+
+
 def test_what_is_missing_is_named(folder, tmp_path, capfd):
     recorded = small_bag.recording(seconds=0.2).without('thermal/image_raw')
     recorded.write(tmp_path / 'bag')

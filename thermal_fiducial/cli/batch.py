@@ -4,13 +4,14 @@ import argparse
 from pathlib import Path
 import sys
 
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.subcommands import add_remap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import parse_remaps
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Options of the command."""
     parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='as for replay')
     parser.add_argument(

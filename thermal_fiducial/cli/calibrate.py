@@ -13,8 +13,9 @@ from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
 from thermal_fiducial.cli.marker_sizes import add_thickness
+from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import tracked
-from thermal_fiducial.cli.subcommands import add_command, add_remap, file_to_write
+from thermal_fiducial.cli.subcommands import add_remap, file_to_write
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
@@ -38,7 +39,7 @@ _USUAL = PoseEkfConfig()
 _REMEDY = 'record a minute with turns about all three axes and motion along them'
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Sub-commands of ``calibrate``."""
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
     calibrate_intrinsics.add_arguments(add_command(commands, 'intrinsics', 'camera_info from thermal views of a board'))
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 # --- camera against IMU -------------------------------------------------------------------------------
 
 
-def _add_camera_imu(parser: argparse.ArgumentParser) -> None:
+def _add_camera_imu(parser: Parser) -> None:
     parser.set_defaults(do=_camera_imu)
     parser.add_argument(
         'bag',
@@ -95,6 +96,8 @@ def _camera_imu(args: argparse.Namespace) -> int:
         camera = _camera_of(bag, args.calibration)
         imu, start_ns = imu_track(bag)
         detector = mapped_detector(marker_map, args.plate_thickness)
+        if args.plate_thickness and _has_corners_only(bag):
+            raise InputError(f'--plate-thickness has no effect with {args.bag}, which has corners instead of images')
         found = _recorded_rows(bag) if _has_corners_only(bag) else _detected_rows(bag, detector, camera)
         seen = sorted(_mapped_corners(found, marker_map), key=lambda frame: frame.stamp_ns)
     if not seen:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermal_fiducial.calibration.sources import imu_track
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.subcommands import add_remap, file_to_write
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.types import FloatArray
@@ -23,7 +24,7 @@ _LONG_S = 600.0
 _SHOWN = (0.01, 0.1, 1.0, 10.0, 100.0, 1000.0)
 
 
-def add_imu(parser: argparse.ArgumentParser) -> None:
+def add_imu(parser: Parser) -> None:
     """Options of the action."""
     parser.set_defaults(do=calibrate_imu)
     parser.add_argument(

@@ -14,6 +14,7 @@ from thermal_fiducial.calibration.report import BoardView, write_report
 from thermal_fiducial.calibration.sources import is_folder_of_pictures, measured_points
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
 from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.ranges import BOARD_MM, BOARD_POINTS, FOCAL_PX, IMAGE_PX, MORE_POINTS
 from thermal_fiducial.cli.subcommands import add_remap, file_to_write, whole_number
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
@@ -30,9 +31,10 @@ from thermal_fiducial.files.writing import write_text
 _SHADES = ' .:+#'
 #: Boards; ``circles`` are OpenCV's asymmetric grid.
 TARGETS = ('chessboard', 'circles', 'symmetric-circles', 'markers')
+_OF_CIRCLES = ('--longer-rows', '--missing', '--diameter')
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Options of ``calibrate intrinsics``."""
     parser.set_defaults(do=_intrinsics)
     parser.add_argument(
@@ -57,6 +59,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_remap(parser)
     _add_board(parser.add_argument_group('board'))
+    _refuse_what_is_for_others(parser)
+
+
+def _refuse_what_is_for_others(parser: Parser) -> None:
+    """Refuse options that the source, or the board, has no use for."""
+    parser.refuse(
+        ['--target', *_OF_CIRCLES, '--grid', '--spacing', '--board', '--most-views', '--every', '--remap'],
+        'with a CSV file of measured points',
+        _has_points,
+    )
+    parser.refuse(['--size'], 'without a CSV file of measured points', lambda args: not _has_points(args))
+    parser.refuse(['--every', '--remap'], 'with a folder of pictures', lambda args: is_folder_of_pictures(args.source))
+    parser.refuse(_OF_CIRCLES, 'without --target circles', lambda args: not args.target.endswith('circles'))
+    parser.refuse(['--grid', '--spacing'], 'with --target markers', lambda args: args.target == 'markers')
+    parser.refuse(['--board'], 'without --target markers', lambda args: args.target != 'markers')
+
+
+def _has_points(args: argparse.Namespace) -> bool:
+    return bool(args.source.suffix.lower() == '.csv')
 
 
 def _add_board(group: argparse._ArgumentGroup) -> None:
@@ -117,7 +138,7 @@ def _intrinsics(args: argparse.Namespace) -> int:
 
 
 def _views(args: argparse.Namespace) -> BoardViews:
-    if args.source.suffix.lower() == '.csv':
+    if _has_points(args):
         if args.size is None:
             raise InputError(f'{args.source}: points without pictures need --size WIDTH HEIGHT')
         named = [BoardView(name, sighting) for name, sighting in measured_points(args.source, *args.size)]

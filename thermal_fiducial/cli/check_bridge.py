@@ -7,6 +7,7 @@ import sys
 import textwrap
 from typing import TYPE_CHECKING
 
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.bridge_check import check_bridge, Finding, Level
 from thermal_fiducial.report.bridge_links import check_links
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 _WIDTH = 118
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Options of the command."""
     parser.description = (
         'Verify rate, stamps, frames (gravity of a still drone, a yaw turn), velocity and covariance of what a flight '
@@ -35,6 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--ros-args', nargs=argparse.REMAINDER, default=[], help='remaps and the like, as for any node; last'
     )
     parser.add_argument('--json', action='store_true', help='print the findings as JSON')
+    parser.refuse(['--seconds', '--ros-args'], 'with a RECORDING', lambda args: args.recording is not None)
+    parser.refuse(['--imu'], 'without a RECORDING', lambda args: args.recording is None)
 
 
 def run(args: argparse.Namespace) -> int:

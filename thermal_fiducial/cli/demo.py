@@ -9,6 +9,7 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from thermal_fiducial.cli.evaluate import make_video, print_tables
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.subcommands import whole_number
 from thermal_fiducial.errors import InputError
@@ -28,7 +29,7 @@ MARK = '.thermal_fiducial_demo'
 ROS_PACKAGES = ('rclpy', 'sensor_msgs', 'geometry_msgs', 'diagnostic_msgs')
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Options of the command."""
     parser.add_argument('--out', type=Path, default=Path('runs/demo'), metavar='RUN', help='folder')
     parser.add_argument('--seconds', type=float, default=30.0, help='length of the flight [s], 11 or more')

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.errors import InputError
@@ -20,7 +21,7 @@ COMPARISON = Path('comparison.html')
 _WHOLE = 44
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Options of the command."""
     parser.add_argument('folders', type=Path, nargs='+', metavar='RUN', help='run folder, as replay leaves it')
     parser.add_argument(
@@ -44,14 +45,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--compare', action='store_true', help="several runs side by side, with evo's conventions and numbers"
     )
     parser.add_argument('--out', type=file_to_write, metavar='HTML', help=f'page of --compare (default: {COMPARISON})')
+    parser.refuse(['--truth-map', '--bag', '--video'], 'with --compare', lambda args: args.compare)
+    parser.refuse(['--out'], 'without --compare', lambda args: not args.compare)
+    parser.refuse(['--out'], 'with --no-report', lambda args: args.no_report)
+    parser.refuse(['--bag'], 'with --no-report', lambda args: args.no_report and not args.video)
 
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate a run, print the tables, write ``summary.json`` and ``report.html``."""
     if args.compare:
         return _compare(args)
-    if args.out is not None:
-        raise InputError('--out names the page of --compare; the report of a run is written into its folder')
     if len(args.folders) > 1:
         raise InputError('several runs are shown side by side with --compare')
     if not args.no_report:
@@ -81,9 +84,6 @@ def make_video(run: Run, bag: Path | None = None) -> None:
 
 
 def _compare(args: argparse.Namespace) -> int:
-    alone = {'--truth-map': args.truth_map, '--bag': args.bag, '--video': args.video}
-    for name in (name for name, given in alone.items() if given):
-        raise InputError(f'{name} is for one run, not for --compare')
     page = args.out or COMPARISON
     try:
         from thermal_fiducial.report.comparison import compare
@@ -98,7 +98,8 @@ def _compare(args: argparse.Namespace) -> int:
             print(comparison.note)
     if not args.no_report:
         comparison.write(page)
-        print(f'comparison: {page}')
+        if not args.json:
+            print(f'comparison: {page}')
     return 0
 
 

@@ -4,6 +4,9 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import STORAGES
@@ -12,8 +15,11 @@ from thermal_fiducial.files.flight_bags import frame_count, write_recording
 from thermal_fiducial.files.recordings import read_recording
 from thermal_fiducial.files.rig_files import LARGEST_MARKER_M
 
+#: Usual error of corners in pictures of visible light [px].
+_SIGMA_PX = 0.3
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+
+def add_arguments(parser: Parser) -> None:
     """Options of the command."""
     parser.epilog = (
         'layouts:\n'
@@ -36,8 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--sigma-px',
         type=float,
-        default=0.3,
-        help='standard deviation of corners without one of their own [px] (default: 0.3)',
+        help=f'standard deviation of corners without one of their own [px] (default: {_SIGMA_PX:g})',
     )
     parser.add_argument(
         '--late',
@@ -55,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     """Read the recording, write the bag, print how to replay it."""
     if args.marker_size is not None and not 0.0 < args.marker_size <= LARGEST_MARKER_M:
         raise InputError(f'--marker-size {args.marker_size:g} is not between 0 and {LARGEST_MARKER_M:g} m')
-    if not (0.0 < args.sigma_px < 100.0 and 0.0 <= args.late < 10.0):
+    if not (0.0 < (args.sigma_px or _SIGMA_PX) < 100.0 and 0.0 <= args.late < 10.0):
         raise InputError('--sigma-px is between 0 and 100, --late between 0 and 10')
     recording = read_recording(args.folder, args.camera, args.camchain, args.imu)
     rig = recording.rig
@@ -66,10 +71,12 @@ def run(args: argparse.Namespace) -> int:
     if rig.dictionary:
         load_dictionary(rig.dictionary)
     recording = replace(recording, rig=rig)
+    if args.sigma_px is not None and all(np.all(np.isfinite(frame.sigma_px)) for frame in recording.corners):
+        raise InputError(f'--sigma-px has no effect with {args.folder}: no corners without a standard deviation')
     frames = frame_count(recording)
     with progress_bar(f'import {args.folder.name}') as share:
         advance = counted(share, max(frames, 1))
-        write_recording(args.out, recording, args.sigma_px, args.late, args.storage, advance)
+        write_recording(args.out, recording, args.sigma_px or _SIGMA_PX, args.late, args.storage, advance)
     print(
         f'{args.out}: {len(recording.samples)} IMU samples, {frames} frames\n'
         f'replay it with: thermal-fiducial replay {args.out} --params {args.out}/params.yaml --map MAP --out RUN'

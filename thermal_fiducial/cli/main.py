@@ -1,23 +1,19 @@
 """Entry point: runs a command, and reports unusable input in one line with exit status 2."""
 
-import argparse
 from collections.abc import Sequence
 import errno
 from importlib import import_module
 from io import TextIOWrapper
 import os
-from pathlib import Path
 import signal
 import sys
-from typing import Any, NoReturn
 
 from thermal_fiducial import __version__
-from thermal_fiducial.cli.subcommands import add_command, any_path
+from thermal_fiducial.cli.parser import add_command, Parser, PROGRAM
 from thermal_fiducial.errors import InputError, RunError
 from thermal_fiducial.files.reading import shown
 from thermal_fiducial.ros.process.interrupts import Interrupts
 
-PROGRAM = 'thermal-fiducial'
 INSTALL_HINT = "pip install '.[tools,ros]' in the package's folder, or apt on the robot"
 
 #: Commands and their descriptions. Module ``cli/<command>.py`` has ``add_arguments(parser)`` and ``run(args) -> int``;
@@ -47,44 +43,6 @@ INTERRUPTED = 130
 
 #: Modules of commands with a name that no module can have.
 MODULES = {'import': 'import_recording'}
-
-
-class _Help(argparse.HelpFormatter):
-    """Adds the default to the help of each option that does not mention it; keeps the lines of long texts."""
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        default = action.default
-        needs_none = action.nargs == 0 or action.required
-        if needs_none or not action.option_strings or 'default' in (action.help or ''):
-            return action.help
-        values = list(default) if isinstance(default, (list, tuple)) else [default]
-        if not values or values[0] in (None, ''):
-            values = ['none']
-        text = ' '.join(f'{value:g}' if isinstance(value, float) else str(value) for value in values)
-        return f'{action.help or ""} (default: {text.replace("%", "%%")})'.lstrip()
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        lines = text.splitlines()
-        return text if len(lines) > 1 else super()._fill_text(text, width, indent)
-
-
-class _Parser(argparse.ArgumentParser):
-    """Parser of the program; argparse uses the same class for its commands."""
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**{'formatter_class': _Help, **options})
-        self.register('type', Path, any_path)
-
-    def parse_known_args(self, *given: Any, **options: Any) -> Any:
-        """Name arguments that a command does not have with its own usage; argparse does with that of the program."""
-        args, unknown = super().parse_known_args(*given, **options)
-        if unknown and self.prog != PROGRAM:
-            self.error(f'unrecognized arguments: {" ".join(unknown)}')
-        return args, unknown
-
-    def error(self, message: str) -> NoReturn:
-        """End the process for wrong usage, and name what lists the arguments."""
-        super().error(f'{message} ({self.prog} --help)')
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -129,7 +87,7 @@ def _finished(argv: Sequence[str], interrupts: Interrupts) -> int:
 
 def _run(argv: Sequence[str]) -> int:
     """Parse the arguments and run their command."""
-    parser: argparse.ArgumentParser = _Parser(
+    parser = Parser(
         prog=PROGRAM, description='Thermal-inertial localization from acrylic markers, for drones in smoke and fog.'
     )
     parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')

@@ -10,8 +10,9 @@ import numpy as np
 
 from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
 from thermal_fiducial.cli.marker_sizes import add_sizes, join_sizes
+from thermal_fiducial.cli.parser import add_command, Commands, Parser
 from thermal_fiducial.cli.ranges import SIGMA_DEG, SIGMA_M
-from thermal_fiducial.cli.subcommands import add_command, Commands, file_to_write
+from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
@@ -35,7 +36,7 @@ _SIZE_WITHOUT = {
 }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Sub-commands of ``map``."""
     add_sizes(parser)
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
@@ -63,6 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     map_cloud.add_align(add_command(commands, 'align', 'align a map to a point cloud of the place'))
     for name, action in commands.choices.items():
         add_sizes(action, behind=True, without=_SIZE_WITHOUT.get(name, 'none'))
+    for place in (parser, commands.choices['undo']):
+        place.refuse(['--marker-size', '--marker-size-override'], 'with map undo', lambda args: args.do is _undo)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -73,9 +76,7 @@ def run(args: argparse.Namespace) -> int:
     return int(args.do(args))
 
 
-def _command(
-    commands: Commands, name: str, text: str, do: Callable[[argparse.Namespace], int]
-) -> argparse.ArgumentParser:
+def _command(commands: Commands, name: str, text: str, do: Callable[[argparse.Namespace], int]) -> Parser:
     parser = add_command(commands, name, text)
     parser.add_argument('map', type=Path, metavar='MAP', help='map file (YAML)')
     parser.set_defaults(do=do)

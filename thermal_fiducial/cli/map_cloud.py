@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.se3 import apply, inverse, quaternion_from_rotation, transform_from_quaternion
@@ -19,7 +20,7 @@ from thermal_fiducial.map_tools.cloud_alignment import align_to_cloud, CloudAlig
 _DRAWN = 200_000
 
 
-def add_align(parser: argparse.ArgumentParser) -> None:
+def add_align(parser: Parser) -> None:
     """Arguments of ``map align``."""
     parser.add_argument('map', type=Path, metavar='MAP', help='map file (YAML)')
     parser.add_argument('--cloud', type=Path, required=True, metavar='FILE', help='point cloud, .ply or .pcd')

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from thermal_fiducial.cli.evaluate import print_tables
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.report.map_error import map_accuracy, marker_errors
@@ -11,7 +12,7 @@ from thermal_fiducial.report.table import number, Table
 from thermal_fiducial.report.tables import map_error_table
 
 
-def add_error(parser: argparse.ArgumentParser) -> None:
+def add_error(parser: Parser) -> None:
     """Arguments of the action."""
     parser.description = (
         'Errors of the markers that both maps have: positions and attitudes in the frame of the map, positions also '

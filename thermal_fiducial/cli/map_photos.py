@@ -40,10 +40,10 @@ def detect_in_photos(photos: list[Path], camera: Camera, args: argparse.Namespac
     Raises
     ------
     InputError
-        A file is no picture, or its size is not that of the ``camera``.
+        A file is no picture, or its size is not that of the ``camera``; a thickness of plates without thermal pictures.
     """
     detector, photo_detector = _detector(args), _photo_detector(args)
-    frames = []
+    frames, thermal = [], False
     with progress_bar('detecting') as progress:
         for k, photo in enumerate(photos):
             progress(k / len(photos))
@@ -51,9 +51,12 @@ def detect_in_photos(photos: list[Path], camera: Camera, args: argparse.Namespac
             with naming(photo):
                 camera.require_size_of(counts)
             if counts.dtype == np.uint16:
+                thermal = True
                 frames.append(detector.detect(k * _APART_NS, counts.astype(np.uint16), camera))
             else:
                 frames.append(_detect_in_photo(photo_detector, counts.astype(np.uint8), camera, detector))
+    if args.plate_thickness and not thermal:
+        raise InputError(f'--plate-thickness has no effect with the photos of {photos[0].parent}, all of 8 bit')
     return frames
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from thermal_fiducial.cli.map_photos import detect_in_photos, isotropic, photos_in
 from thermal_fiducial.cli.marker_sizes import add_thickness
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.run_parameters import camera_of_run, dictionary_of_run, sizes_of_run
 from thermal_fiducial.cli.subcommands import file_to_write, whole_number
@@ -46,7 +47,7 @@ _MOST_OUTSIDE = 0.05
 _DICTIONARY = ArucoDetectorConfig().dictionary
 
 
-def add_build(parser: argparse.ArgumentParser) -> None:
+def add_build(parser: Parser) -> None:
     """Arguments of ``map build``."""
     parser.add_argument('images', type=Path, metavar='FOLDER', help='photos of the markers, in any order')
     parser.add_argument(
@@ -63,7 +64,7 @@ def add_build(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(do=_build)
 
 
-def add_refine(parser: argparse.ArgumentParser) -> None:
+def add_refine(parser: Parser) -> None:
     """Arguments of ``map refine``."""
     parser.add_argument('map', type=Path, metavar='MAP', help='the map to adjust; its fixed markers stay')
     parser.add_argument('run_folder', type=Path, metavar='RUN', help='run folder with detections.csv, or such a file')

@@ -2,12 +2,13 @@
 
 import argparse
 
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.core.types import Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
 
 
-def add_choice(parser: argparse.ArgumentParser) -> None:
+def add_choice(parser: Parser) -> None:
     """Add the options."""
     parser.add_argument(
         '--dictionary', default='STENCIL_4X4_100', help='dictionary of OpenCV or of this package, or a file'

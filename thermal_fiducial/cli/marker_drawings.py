@@ -9,6 +9,7 @@ import sys
 import numpy as np
 
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import LENGTH_MM
 from thermal_fiducial.core.geometry import se3
@@ -40,7 +41,7 @@ _OPTION_HELP = {
 }
 
 
-def add_make(parser: argparse.ArgumentParser) -> None:
+def add_make(parser: Parser) -> None:
     """Arguments of ``markers make``."""
     parser.set_defaults(do=_make)
     add_choice(parser)
@@ -56,7 +57,7 @@ def _make(args: argparse.Namespace) -> int:
     return 0
 
 
-def add_sheet(parser: argparse.ArgumentParser) -> None:
+def add_sheet(parser: Parser) -> None:
     """Arguments of ``markers sheet``."""
     parser.set_defaults(do=_sheet)
     add_choice(parser)
@@ -83,7 +84,7 @@ def _say_parameters(args: argparse.Namespace) -> None:
     print(f'parameters of the nodes for these markers: dictionary: {args.dictionary}, {metres}')
 
 
-def add_board(parser: argparse.ArgumentParser) -> None:
+def add_board(parser: Parser) -> None:
     """Arguments of ``markers board``."""
     parser.set_defaults(do=_board)
     parser.add_argument('kind', choices=('circles', 'markers'), help='one stencil of holes, or markers on a base plate')
@@ -97,6 +98,12 @@ def add_board(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--dictionary', default='STENCIL_4X4_100', help='of the markers')
     add_plate_options(parser, size=130.0)
     _add_output(parser)
+    parser.refuse(['--diameter'], 'on a board of markers', lambda args: args.kind == 'markers')
+    parser.refuse(
+        ['--dictionary', '--mount', '--min-web', *(_option(name) for name in (*_OPTION_HELP, 'quiet_cells'))],
+        'on a board of circles',
+        lambda args: args.kind == 'circles',
+    )
 
 
 def _board(args: argparse.Namespace) -> int:
@@ -136,19 +143,35 @@ def _board_map(centres: FloatArray, options: PlateOptions, dictionary: str) -> M
     return MarkerMap(markers, dictionary=dictionary)
 
 
-def add_plate_options(parser: argparse.ArgumentParser, size: float = PlateOptions.size) -> None:
-    """Options for the dimensions of a plate; ``size`` is the default side of the black square [mm]."""
+def _option(name: str) -> str:
+    return '--' + name.replace('_', '-')
+
+
+def add_plate_options(parser: Parser, size: float = PlateOptions.size, without: Sequence[str] = ()) -> None:
+    """Options for the dimensions of a plate; ``size`` is the default side of the black square [mm].
+
+    Those of ``without`` are left out, and keep their defaults.
+    """
     group = parser.add_argument_group('plate', 'all lengths in millimetres')
     group.add_argument('--mount', choices=MOUNTS, default='ears', help='mount of the pattern')
     for name, description in _OPTION_HELP.items():
+        if name in without:
+            parser.set_defaults(**{name: getattr(PlateOptions, name)})
+            continue
         default = size if name == 'size' else getattr(PlateOptions, name)
-        group.add_argument('--' + name.replace('_', '-'), type=float, default=default, metavar='MM', help=description)
+        group.add_argument(_option(name), type=float, default=default, metavar='MM', help=description)
     group.add_argument(
         '--quiet-cells', type=float, default=1.0, metavar='CELLS', help='width of the warm ring around the pattern'
     )
     group.add_argument(
         '--min-web', type=LENGTH_MM, default=3.0, metavar='MM', help='least width of acrylic between holes'
     )
+    parser.refuse(['--frame-width'], 'without --mount frame', lambda args: args.mount != 'frame')
+    parser.refuse(['--hole-diameter', '--stand-off', '--tie-width'], 'with --mount none', _is_bare)
+
+
+def _is_bare(args: argparse.Namespace) -> bool:
+    return bool(args.mount == 'none')
 
 
 def plate_options(args: argparse.Namespace) -> PlateOptions:
@@ -156,13 +179,14 @@ def plate_options(args: argparse.Namespace) -> PlateOptions:
     return PlateOptions(**{item.name: getattr(args, item.name) for item in fields(PlateOptions)})
 
 
-def _add_output(parser: argparse.ArgumentParser) -> None:
+def _add_output(parser: Parser) -> None:
     parser.add_argument('--out', type=Path, default=Path('markers'), metavar='FOLDER', help='folder of the files')
     parser.add_argument('--formats', default='svg,dxf,pdf,png', help='formats, separated by commas')
     parser.add_argument(
         '--paper', metavar='PAPER', help=f'PDF in tiles for a printer: {", ".join(PAPERS)} (default: one page)'
     )
     add_force(parser)
+    parser.refuse(['--paper'], 'without pdf among --formats', lambda args: 'pdf' not in args.formats.split(','))
 
 
 def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cells: int | None = None) -> None:
@@ -182,7 +206,7 @@ def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cel
             progress(done / len(drawings))
 
 
-def add_force(parser: argparse.ArgumentParser) -> None:
+def add_force(parser: Parser) -> None:
     """Add the option that allows overwriting files."""
     parser.add_argument('--force', action='store_true', help='overwrite files that exist')
 

@@ -7,6 +7,7 @@ import numpy as np
 from rich.table import Table
 
 from thermal_fiducial.cli.marker_drawings import add_force, refuse_to_overwrite
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import (
     AFTER_S,
@@ -50,7 +51,7 @@ _CONTRASTS = (1.0, 2.0, 4.0, 8.0, 20.0, 80.0, 300.0)
 _TILTS_DEG = (0.0, 30.0, 45.0, 55.0, 65.0, 75.0)
 
 
-def add_plan(parser: argparse.ArgumentParser) -> None:
+def add_plan(parser: Parser) -> None:
     """Arguments of ``markers plan``."""
     parser.set_defaults(do=_plan)
     camera = parser.add_argument_group('camera')
@@ -95,6 +96,7 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--tables', type=Path, default=PACKAGED, help='file of ``markers measure`` (default: that of the package)'
     )
+    parser.refuse(['--lens'], 'with --calibration', lambda args: args.calibration is not None)
 
 
 def _plan(args: argparse.Namespace) -> int:
@@ -220,7 +222,7 @@ def _draw(
             raise InputError(f'{args.plot}: {error}') from None
 
 
-def add_measure(parser: argparse.ArgumentParser) -> None:
+def add_measure(parser: Parser) -> None:
     """Arguments of ``markers measure``."""
     parser.set_defaults(do=_measure)
     parser.add_argument('out', type=file_to_write, help='file to write (YAML)')

@@ -2,12 +2,13 @@
 
 import argparse
 
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.ranges import SIDE_M
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.errors import InputError
 
 
-def add_sizes(parser: argparse.ArgumentParser, *, behind: bool = False, without: str = 'none') -> None:
+def add_sizes(parser: Parser, *, behind: bool = False, without: str = 'none') -> None:
     """Add the options to a command, or to one of its actions (``behind``); ``without``: the side if none is given."""
     size = argparse.SUPPRESS if behind else None
     text = f'side of markers whose entry has none [m] (default: {without})'
@@ -24,7 +25,7 @@ def add_sizes(parser: argparse.ArgumentParser, *, behind: bool = False, without:
     )
 
 
-def add_thickness(parser: argparse.ArgumentParser) -> None:
+def add_thickness(parser: Parser) -> None:
     """Add the option for the thickness of the plates, as the nodes have it."""
     parser.add_argument(
         '--plate-thickness',

@@ -5,8 +5,9 @@ from collections import Counter
 
 from thermal_fiducial.cli import marker_drawings, marker_planning
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
+from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.subcommands import add_command, file_to_write, whole_number
+from thermal_fiducial.cli.subcommands import file_to_write, whole_number
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.errors import InputError
@@ -19,7 +20,7 @@ from thermal_fiducial.files.dictionary import PACKAGED, save_dictionary
 from thermal_fiducial.files.writing import write_text
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Sub-commands of ``markers``."""
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
     _add_check(add_command(commands, 'check', 'check which markers of a dictionary can be cut in one piece'))
@@ -39,10 +40,11 @@ def run(args: argparse.Namespace) -> int:
     return int(args.do(args))
 
 
-def _add_check(parser: argparse.ArgumentParser) -> None:
+def _add_check(parser: Parser) -> None:
     parser.set_defaults(do=_check)
     add_choice(parser)
-    marker_drawings.add_plate_options(parser)
+    # Spacers change nothing of what is cut.
+    marker_drawings.add_plate_options(parser, without=('stand_off',))
 
 
 def _check(args: argparse.Namespace) -> int:
@@ -77,7 +79,7 @@ def _check(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_bridge(parser: argparse.ArgumentParser) -> None:
+def _add_bridge(parser: Parser) -> None:
     parser.set_defaults(do=_bridge)
     add_choice(parser)
     parser.add_argument('--size', type=float, default=300.0, metavar='MM', help='side of the black square')
@@ -100,7 +102,7 @@ def _bridge(args: argparse.Namespace) -> int:
     return 0
 
 
-def _add_dictionary(parser: argparse.ArgumentParser) -> None:
+def _add_dictionary(parser: Parser) -> None:
     parser.set_defaults(do=_dictionary)
     parser.add_argument(
         'out', type=file_to_write, help="dictionary file to write (YAML); its name becomes the dictionary's"

@@ -7,6 +7,7 @@ from pathlib import Path
 import sys
 import time
 
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.subcommands import add_remap
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
@@ -14,7 +15,7 @@ from thermal_fiducial.files.bags import parse_remaps
 from thermal_fiducial.replay.earlier_runs import refuse_other_folder
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Options of the command."""
     parser.add_argument('bag', type=Path, metavar='BAG', help='rosbag2 folder, .mcap or .db3 file, or ROS 1 .bag')
     parser.add_argument('--out', type=Path, required=True, metavar='RUN', help='folder for the results')
@@ -60,14 +61,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--no-report', action='store_true', help='write no report.html')
     parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
+    parser.refuse(['--rate'], 'without --transport processes', lambda args: args.transport != 'processes')
 
 
 def run(args: argparse.Namespace) -> int:
     """Replay the bag, write the run folder, print a summary."""
     if args.rate is not None and not 0.0 < args.rate <= 100.0:
         raise InputError(f'--rate {args.rate:g} is not between 0 and 100')
-    if args.rate is not None and args.transport != 'processes':
-        raise InputError('--rate is for --transport processes: in lock-step the nodes are as fast as they can be')
     refuse_other_folder(args.out)
     _check_packages(report=not args.no_report, video=args.video)
     replay = importlib.import_module('thermal_fiducial.replay.session')

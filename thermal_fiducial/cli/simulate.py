@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 import textwrap
 
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.ranges import CONTRAST_K, FOG_PER_M
 from thermal_fiducial.cli.simulate_corners import write_corner_flight
@@ -33,7 +34,7 @@ _RANGES = {
 }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Options of the command."""
     parser.epilog = (
         f'scenarios:\n{_scenarios()}\n\nOUT becomes a rosbag2 with ground_truth.tum, map_true.yaml, map_one.yaml (one\n'
@@ -78,6 +79,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--trajectory', type=Path, metavar='TUM', help=f'fly these poses of base_link in map (default: {_OWN})'
     )
     parser.add_argument('--workers', type=int, default=_cores(), help='number of processes (default: one a core)')
+    parser.refuse(
+        ['--contrast', '--inverted', '--fog', '--lag', '--readout', '--ffc', '--workers'],
+        'with a --scenario without pictures',
+        lambda args: named(args.scenario).corner_noise is not None,
+    )
 
 
 def _scenarios() -> str:

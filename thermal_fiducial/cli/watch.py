@@ -7,6 +7,7 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.watching.live_status import Advice, LiveState, LiveStatus
 
@@ -19,7 +20,7 @@ _LEVELS = ('green', 'yellow', 'red')
 _LINE_S, _SCREEN_S = 1.0, 0.25
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """Options of the command."""
     parser.description = (
         'Show whether the pose may be flown on, and why not: markers in view, rates, latency, sigma, clock offset, '
@@ -33,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--ros-args', nargs=argparse.REMAINDER, default=[], help='remaps and the like, as for any node; last'
     )
+    parser.refuse(['--wait'], 'without --once', lambda args: not args.once)
 
 
 def run(args: argparse.Namespace) -> int:

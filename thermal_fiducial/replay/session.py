@@ -127,8 +127,10 @@ def _cast_from(entry: Entry, settings: Settings, *, images: bool) -> tuple[tuple
     Raises
     ------
     InputError
-        A second camera of a bag that begins behind the cameras.
+        A second camera, or images to record, of a bag that begins behind the cameras.
     """
+    if images and entry.skipped:
+        raise InputError(f'--images has no effect with input from {entry.topic} (--from): the nodes get no images')
     from_file = bool(settings.tau2_camera.calibration_file)
     played = entry.played(calibration_from_file=from_file)
     recorded = entry.recorded(calibration_from_file=from_file, images=images)

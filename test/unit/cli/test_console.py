@@ -92,7 +92,7 @@ def test_a_table_that_fits_the_window_stays_within_it(monkeypatch):
     ('command', 'said'),
     [
         (['replay', 'nope.mcap', '--out', 'run', '--no-report'], 'nope.mcap: no such bag'),
-        (['replay', 'nope.mcap', '--out', 'run', '--rate', '2'], '--rate is for --transport processes'),
+        (['replay', 'nope.mcap', '--out', 'run', '--rate', '2'], '--rate has no effect without --transport processes'),
         (['calibrate', 'intrinsics', 'nope'], 'nope: no such folder of pictures, bag or CSV file'),
     ],
 )

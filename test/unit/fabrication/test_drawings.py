@@ -387,9 +387,12 @@ def test_unusable_input_is_one_line(wrong, tmp_path, capsys):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize('command', [['make', '--ids', '2'], ['sheet', '--ids', '2'], ['board', 'circles']])
+@pytest.mark.parametrize(
+    'command',
+    [['make', '--ids', '2', '--size', '120'], ['sheet', '--ids', '2', '--size', '120'], ['board', 'circles']],
+)
 def test_files_that_exist_are_kept_unless_forced(tmp_path, capsys, command):
-    arguments = ['markers', *command, '--size', '120', '--formats', 'dxf', '--out', str(tmp_path)]
+    arguments = ['markers', *command, '--formats', 'dxf', '--out', str(tmp_path)]
     assert main(arguments) == 0
     (made,) = tmp_path.iterdir()
     made.write_text('mine')

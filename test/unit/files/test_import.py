@@ -257,3 +257,12 @@ def test_what_is_no_file_is_not_taken_for_nothing(ours, capsys, name):
 def test_options_that_cannot_be_used(ours, capsys, options):
     assert run(ours, *options) == 2
     assert options[0] in capsys.readouterr().err
+
+
+def test_an_error_of_corners_is_refused_where_all_have_their_own(ours, capsys):
+    lines = (ours / 'cam1.csv').read_text().splitlines()
+    with_sigma = [f'{line},{"0.2" if number else "sigma_px"}' for number, line in enumerate(lines)]
+    (ours / 'cam1.csv').write_text('\n'.join(with_sigma) + '\n')
+    assert run(ours, '--sigma-px', '0.3') == 2
+    assert '--sigma-px has no effect with' in capsys.readouterr().err
+    assert run(ours) == 0

@@ -123,6 +123,12 @@ def test_a_map_from_thermal_photos_claims_what_they_show(photographed, poses, tm
         assert np.linalg.norm(d[:3]) < 0.005
 
 
+def test_a_thickness_of_plates_is_refused_with_photos_of_visible_light(photographed, tmp_path, capsys):
+    options = '--origin', 2, '--marker-size', SIZE, '--plate-thickness', 0.003
+    assert build(photographed, *options, '--out', tmp_path / 'a.yaml') == 2
+    assert '--plate-thickness has no effect with the photos' in capsys.readouterr().err
+
+
 def test_a_thickness_in_millimetres_is_refused(photographed, tmp_path, capsys):
     assert (
         build(photographed, '--origin', 2, '--marker-size', SIZE, '--plate-thickness', 3, '--out', tmp_path / 'a.yaml')

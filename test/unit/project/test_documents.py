@@ -1,6 +1,5 @@
 """The documents say what the code does, and stay short."""
 
-import argparse
 from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
@@ -11,6 +10,7 @@ import documents
 import pytest
 
 from thermal_fiducial.cli.main import COMMANDS, MODULES
+from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.config import NODES, OPTIONAL_NODES
 from thermal_fiducial.core.filter.state import SIZE
 from thermal_fiducial.files.map_format import MapDocument, MarkerEntry
@@ -155,6 +155,6 @@ def shown(program):
 def test_commands_in_the_documents_are_understood(words):
     command, *arguments = words
     assert command in COMMANDS
-    parser = argparse.ArgumentParser()
+    parser = Parser()
     import_module(f'thermal_fiducial.cli.{MODULES.get(command, command.replace("-", "_"))}').add_arguments(parser)
     assert parser.parse_args(arguments)
