@@ -1,13 +1,11 @@
 """What a frame costs the mapper in a large map, and what an hour of mapping leaves in memory."""
 
-from concurrent.futures import ProcessPoolExecutor
-import multiprocessing
-import os
 from pathlib import Path
 import time
 
 import numpy as np
 from support.crowds import crowd, frames, mapped, SIZE
+from support.jobs import Elsewhere
 from support.walls import CAMERA, flight, FRAME_NS, see, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
@@ -43,18 +41,18 @@ def an_hour(elsewhere):
 
     Parameters
     ----------
-    elsewhere : that process
+    elsewhere : that process, which calls ``refine``
     """
     rng = np.random.default_rng(0)
     poses = wall(rng)
     m = MarkerMapper(MarkerMapperConfig(), MarkerMap({0: MapMarker(0, 0.3, True, poses[0])}))
     seen = [see(flight(k / 5), poses, 0.05, rng) for k in range(300)]
-    processes, memory = ('self', elsewhere.submit(os.getpid).result()), []
+    processes, memory = ('self', elsewhere.pid), []
     for k in range(HOUR):
         stamp = (k + 1) * INTERVAL_NS
         m.process(stamp, seen[k % len(seen)], CAMERA)
         if m.refinement_due(stamp):
-            refinement = elsewhere.submit(refine, m.snapshot()).result()
+            refinement = elsewhere(m.snapshot())
             assert refinement is not None or len(m.map.markers) == 1
             if refinement is not None:
                 m.apply(refinement)
@@ -76,7 +74,7 @@ def test_scale_of_the_map(benchmark, write_table):
         small, large = np.min(pairs, axis=0)
         rows.append((f'time of a frame, {mode}', f'{small:.2f} ms', f'{large:.2f} ms', f'{large / small:.2f}'))
         ratios.append(large / small)
-    with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as elsewhere:
+    with Elsewhere(refine) as elsewhere:
         kept, refinements, error, early, late = benchmark.pedantic(an_hour, args=(elsewhere,), rounds=1)
     what = f'an hour of mapping: {kept} keyframes, {refinements} refinements, largest error {error:.1f} mm'
     for row, before, after in zip((what, 'process of the refinements'), early, late, strict=True):

@@ -55,23 +55,56 @@ def outcomes(
                     worker.begun += 1
                     pipe.send(worker.job)
                 else:
-                    _end(pipe, running.pop(pipe))
+                    _kill(running.pop(pipe).process, pipe)
                 if isinstance(outcome, Exception):
                     raise outcome
                 yield job, outcome
     finally:
         for pipe, worker in running.items():
-            _end(pipe, worker)
+            _kill(worker.process, pipe)
+
+
+class Elsewhere:
+    """One process that calls a function of a module with one job after another, so that its memory is its own.
+
+    Attributes
+    ----------
+    pid : of the process
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._pipe, self._process = _connected(_serve, function)
+        self.pid = self._process.pid
+
+    def __enter__(self) -> 'Elsewhere':
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        _kill(self._process, self._pipe)
+
+    def __call__(self, *job: Any) -> Any:
+        """What the function returned, or ``Died``. Raises the exceptions of the function."""
+        self._pipe.send(job)
+        outcome = _received(self._pipe)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
 
 
 def _started(function: Callable[..., Any], job: tuple[Any, ...]) -> tuple[Connection, _Worker]:
+    pipe, process = _connected(_serve_from, function, job)
+    return pipe, _Worker(process, job)
+
+
+def _connected(serve: Callable[..., None], *arguments: Any) -> tuple[Connection, BaseProcess]:
+    """Our end of a pipe, and the process that calls ``serve`` with ``arguments`` and the other end."""
     context = multiprocessing.get_context('spawn')
     ours, theirs = context.Pipe()
     # The parent keeps no copy of the other end, which would keep the pipe open.
     with theirs:
-        process = context.Process(target=_serve, args=(function, job, theirs), daemon=True)
+        process = context.Process(target=serve, args=(*arguments, theirs), daemon=True)
         process.start()
-    return ours, _Worker(process, job)
+    return ours, process
 
 
 def _received(pipe: Connection) -> Any:
@@ -81,20 +114,28 @@ def _received(pipe: Connection) -> Any:
         return Died()
 
 
-def _end(pipe: Connection, worker: _Worker) -> None:
-    worker.process.kill()
-    worker.process.join()
+def _kill(process: BaseProcess, pipe: Connection) -> None:
+    process.kill()
+    process.join()
     pipe.close()
 
 
-def _serve(function: Callable[..., Any], job: tuple[Any, ...], pipe: Connection) -> None:
+def _serve_from(function: Callable[..., Any], job: tuple[Any, ...], pipe: Connection) -> None:
+    pipe.send(_outcome(function, job))
+    _serve(function, pipe)
+
+
+def _serve(function: Callable[..., Any], pipe: Connection) -> None:
     while True:
-        try:
-            outcome = function(*job)
-        except Exception as error:  # raised by the parent, whatever it is
-            outcome = error
-        pipe.send(outcome)
         try:
             job = pipe.recv()
         except EOFError:
             return
+        pipe.send(_outcome(function, job))
+
+
+def _outcome(function: Callable[..., Any], job: tuple[Any, ...]) -> Any:
+    try:
+        return function(*job)
+    except Exception as error:  # raised by the parent, whatever it is
+        return error

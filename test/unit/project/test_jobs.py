@@ -8,7 +8,7 @@ import time
 
 from fuzz.jobs import findings
 import pytest
-from support.jobs import Died, outcomes
+from support.jobs import Died, Elsewhere, outcomes
 from support.tasks import large, work
 
 FIRST = 2_000_000
@@ -30,6 +30,15 @@ def test_a_process_that_dies_costs_its_own_job_alone():
     done = dict(outcomes(work, deque([('die',), (1,), (2,)]), 2))
     assert isinstance(done['die',], Died)
     assert [done[job][1] for job in [(1,), (2,)]] == [1, 2]
+
+
+def test_a_process_elsewhere_does_one_job_after_another():
+    with Elsewhere(work) as elsewhere:
+        assert [elsewhere(number) for number in range(3)] == [(elsewhere.pid, number) for number in range(3)]
+        with pytest.raises(ValueError, match='no answer'):
+            elsewhere('fail')
+        assert isinstance(elsewhere('die'), Died)
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.timeout(60, method='thread')
