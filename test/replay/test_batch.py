@@ -1,5 +1,6 @@
 """Many bags on workers of Dask: the same bytes from any number of them, also when one is killed."""
 
+import errno
 import os
 from pathlib import Path
 import signal
@@ -13,6 +14,7 @@ from support.interrupts import interrupted
 from support.tasks import write_twice
 
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.replay import many_bags
@@ -239,7 +241,7 @@ def killed_at(step, monkeypatch):
         happens()
         return rename(path, target)
 
-    def half_removed(path, ignore_errors):
+    def half_removed(path, ignore_errors=False):
         if len(steps) < step:
             next(file for file in path.rglob('*') if file.is_file()).unlink()
         happens()
@@ -248,18 +250,40 @@ def killed_at(step, monkeypatch):
     monkeypatch.setattr(many_bags.shutil, 'rmtree', half_removed)
 
 
+def written(options, progress, warn):
+    """A replay without nodes."""
+    options.run.mkdir()
+    (options.run / 'new').touch()
+
+
+def test_an_earlier_run_stays_where_the_new_one_cannot_take_its_place(tmp_path, monkeypatch):
+    run = tmp_path / 'flight'
+    run.mkdir()
+    (run / 'old').touch()
+    rename, refused = Path.rename, []
+
+    def full(path, target):
+        if path.name == run.name and path.parent != run.parent and not refused:
+            refused.append(path)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return rename(path, target)
+
+    monkeypatch.setattr(many_bags, 'replay', written)
+    monkeypatch.setattr(Path, 'rename', full)
+    with pytest.raises(InputError, match='No space left'):
+        many_bags.replay_whole(many_bags.Options(bag=Path('flight'), run=run))
+    assert refused
+    assert list(contents(tmp_path)) == [Path('flight/old')]
+
+
 @pytest.mark.parametrize(('step', 'left'), [(1, 'old'), (2, 'old'), (3, 'new')])
 def test_a_worker_that_is_killed_while_it_replaces_a_run_leaves_one_whole(tmp_path, monkeypatch, step, left):
-    def write(options, progress, warn):
-        options.run.mkdir()
-        (options.run / 'new').touch()
-
     run = tmp_path / 'out' / 'flight'
     run.mkdir(parents=True)
     (run / 'old').touch()
     options = many_bags.Options(bag=Path('flight'), run=run)
     with monkeypatch.context() as patched:
-        patched.setattr(many_bags, 'replay', write)
+        patched.setattr(many_bags, 'replay', written)
         killed_at(step, patched)
         with pytest.raises(Killed):
             many_bags.replay_whole(options)

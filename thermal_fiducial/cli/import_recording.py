@@ -14,6 +14,7 @@ from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.flight_bags import frame_count, write_recording
 from thermal_fiducial.files.recordings import read_recording
 from thermal_fiducial.files.rig_files import LARGEST_MARKER_M
+from thermal_fiducial.files.work_folders import made_whole
 
 #: Usual error of corners in pictures of visible light [px].
 _SIGMA_PX = 0.3
@@ -74,9 +75,9 @@ def run(args: argparse.Namespace) -> int:
     if args.sigma_px is not None and all(np.all(np.isfinite(frame.sigma_px)) for frame in recording.corners):
         raise InputError(f'--sigma-px has no effect with {args.folder}: no corners without a standard deviation')
     frames = frame_count(recording)
-    with progress_bar(f'import {args.folder.name}') as share:
+    with made_whole(args.out) as folder, progress_bar(f'import {args.folder.name}') as share:
         advance = counted(share, max(frames, 1))
-        write_recording(args.out, recording, args.sigma_px or _SIGMA_PX, args.late, args.storage, advance)
+        write_recording(folder, recording, args.sigma_px or _SIGMA_PX, args.late, args.storage, advance)
     print(
         f'{args.out}: {len(recording.samples)} IMU samples, {frames} frames\n'
         f'replay it with: thermal-fiducial replay {args.out} --params {args.out}/params.yaml --map MAP --out RUN'

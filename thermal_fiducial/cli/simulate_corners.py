@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-import shutil
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.files.flight_bags import write_recording
 from thermal_fiducial.files.recordings import Corners, Recording
 from thermal_fiducial.files.rig_files import Rig
+from thermal_fiducial.files.work_folders import made_whole
 from thermal_fiducial.sim.corner_flight import corner_frames
 from thermal_fiducial.sim.corner_noise import CornerNoise
 from thermal_fiducial.sim.thermal_camera import FlightPlan
@@ -44,7 +44,9 @@ def simulated_recording(flight: FlightPlan, noise: CornerNoise) -> Recording:
 def write_corner_flight(
     out: Path, flight: FlightPlan, noise: CornerNoise, storage: str, progress: Callable[[int], None]
 ) -> None:
-    """Write the bag ``out`` with ground truth, maps and parameters, as for a flight with pictures.
+    """Write the new folder ``out``, which exists only once it is complete.
+
+    It is a bag with ground truth, maps and parameters, as for a flight with pictures.
 
     Raises
     ------
@@ -52,10 +54,6 @@ def write_corner_flight(
         ``out`` exists or cannot be written.
     """
     late = IMAGE_DELAY_NS / SECOND_NS
-    write_recording(out, simulated_recording(flight, noise), noise.claimed_px, late, storage, progress)
-    try:
-        write_side_files(out, flight)
-    except BaseException:
-        # A flight without its parameters and maps cannot be replayed.
-        shutil.rmtree(out, ignore_errors=True)
-        raise
+    with made_whole(out) as folder:
+        write_recording(folder, simulated_recording(flight, noise), noise.claimed_px, late, storage, progress)
+        write_side_files(folder, flight)

@@ -9,7 +9,37 @@ import re
 import shutil
 import tempfile
 
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.atomic import locked
+from thermal_fiducial.files.writing import into
+
+
+@contextmanager
+def made_whole(out: Path) -> Iterator[Path]:
+    """The path under which to write the new folder ``out``, which has its own name once it is whole.
+
+    Raises
+    ------
+    InputError
+        ``out`` exists or cannot be written.
+    """
+    if out.exists():
+        raise InputError(f'{out} exists already')
+    with into(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with work_folder(out) as folder:
+            with _named_as(out, folder / out.name):
+                yield folder / out.name
+            (folder / out.name).rename(out)
+
+
+@contextmanager
+def _named_as(out: Path, hidden: Path) -> Iterator[None]:
+    """Let errors name ``out`` instead of the ``hidden`` place that the user has never heard of."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(str(error).replace(str(hidden), str(out))) from None
 
 
 @contextmanager

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import json
 from pathlib import Path
 import shutil
-import tempfile
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from thermal_fiducial.errors import InputError, RunError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.files.work_folders import work_folder
 from thermal_fiducial.files.writing import into, write_text
 from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.replay.earlier_runs import refuse_other_folder
@@ -209,16 +209,21 @@ def replay_whole(options: Options) -> list[str]:
     warnings: list[str] = []
     with into(options.run):
         options.run.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f'.{options.run.name}-', dir=options.run.parent))
-        try:
+        with work_folder(options.run) as folder:
             replay(replace(options, run=folder / options.run.name), lambda share: None, warnings.append)
-            # A worker that is killed while it deletes files of an earlier run must not leave the rest of them.
-            if options.run.exists():
-                options.run.rename(_moved_aside(options.run, folder))
-            (folder / options.run.name).rename(options.run)
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
+            _take_the_place(options.run, folder)
     return warnings
+
+
+def _take_the_place(run: Path, folder: Path) -> None:
+    """Replace an earlier run by the new one in ``folder``, which keeps the earlier one until it is removed."""
+    try:
+        # A worker that is killed while it deletes files of an earlier run must not leave the rest of them.
+        if run.exists():
+            run.rename(_moved_aside(run, folder))
+        (folder / run.name).rename(run)
+    finally:
+        _put_back(folder, run)
 
 
 def _moved_aside(run: Path, folder: Path) -> Path:
@@ -227,7 +232,7 @@ def _moved_aside(run: Path, folder: Path) -> Path:
 
 
 def _put_back(unfinished: Path, run: Path) -> None:
-    """Put an earlier run back from the folder of a worker that was killed between the two renames."""
+    """Put an earlier run back from the folder of a worker that was ended between the two renames."""
     with suppress(OSError):
         # Fails where a run is in its place.
         _moved_aside(run, unfinished).rename(run)

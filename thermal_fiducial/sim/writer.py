@@ -24,7 +24,7 @@ from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPI
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry
 from thermal_fiducial.files.rosbags_types import MAP_FRAME
 from thermal_fiducial.files.trajectory_file import save_tum
-from thermal_fiducial.files.work_folders import work_folder
+from thermal_fiducial.files.work_folders import made_whole
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.sim import messages
 from thermal_fiducial.sim.imu import ImuRecord
@@ -92,16 +92,10 @@ def write_flight(
     InputError
         ``out`` exists or cannot be written, or the scenario is impossible.
     """
-    if out.exists():
-        raise InputError(f'{out} exists already')
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with work_folder(out) as folder:
-            _write_bag(folder / out.name, flight, storage, workers, progress or (lambda _: None))
-            write_side_files(folder / out.name, flight)
-            (folder / out.name).rename(out)
-    except OSError as error:
-        raise InputError(f'{out}: {error.strerror}') from None
+        with made_whole(out) as folder:
+            _write_bag(folder, flight, storage, workers, progress or (lambda _: None))
+            write_side_files(folder, flight)
     except RendererDiedError:
         raise InputError(f'{out}: a rendering process died, perhaps for lack of memory') from None
 

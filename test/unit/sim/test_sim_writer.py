@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from support.tiny import TINY
 import yaml
 
+from thermal_fiducial.cli import simulate_corners
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.config import from_mapping, PoseEkfConfig
 from thermal_fiducial.errors import InputError
@@ -20,6 +21,7 @@ from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.trajectory_file import load_tum
+from thermal_fiducial.sim.corner_noise import CornerNoise
 from thermal_fiducial.sim.render import Quality
 from thermal_fiducial.sim.scenario import LENSES, SCENARIOS
 from thermal_fiducial.sim.thermal_camera import plan, render_frames, simulate_imu
@@ -340,3 +342,18 @@ def test_everything_beside_the_bag_describes_the_same_rig(bag, messages):
         np.testing.assert_allclose(row[2:].astype(float).reshape(4, 2), pixels, atol=2e-4)
         checked += 1
     assert checked >= 20
+
+
+@pytest.mark.parametrize('error', [KeyboardInterrupt, Exception])
+def test_a_flight_without_pictures_has_its_name_once_it_is_whole(tmp_path, monkeypatch, error):
+    out, begun = tmp_path / 'out', []
+
+    def interrupted(folder, flight):
+        begun.append((folder.is_dir(), out.exists()))
+        raise error
+
+    monkeypatch.setattr(simulate_corners, 'write_side_files', interrupted)
+    with pytest.raises(error):
+        simulate_corners.write_corner_flight(out, plan('april', 11.0), CornerNoise(), 'mcap', lambda _: None)
+    assert begun == [(True, False)]
+    assert not any(tmp_path.iterdir())
