@@ -6,7 +6,8 @@ import sys
 
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.subcommands import add_remap
+from thermal_fiducial.cli.ranges import PROCESSES
+from thermal_fiducial.cli.subcommands import add_remap, whole_number
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import parse_remaps
 
@@ -25,7 +26,7 @@ def add_arguments(parser: Parser) -> None:
         '--mode', choices=('mapping', 'localization'), help='mode of each replay (default: mode of --params)'
     )
     where = parser.add_mutually_exclusive_group()
-    where.add_argument('--workers', type=int, default=1, metavar='N', help='number of processes on this machine')
+    where.add_argument('--workers', type=PROCESSES, default=1, metavar='N', help='number of processes on this machine')
     where.add_argument(
         '--scheduler',
         default='',
@@ -33,15 +34,17 @@ def add_arguments(parser: Parser) -> None:
         help='Dask cluster with access to the same files, tcp://HOST:8786 (default: this machine)',
     )
     parser.add_argument(
-        '--max-frames', type=int, default=1000, metavar='N', help='largest number of frames for the joint map'
+        '--max-frames',
+        type=whole_number(1),
+        default=1000,
+        metavar='N',
+        help='largest number of frames for the joint map',
     )
     add_remap(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Replay the bags, adjust the joint map, print a summary."""
-    if not (1 <= args.workers <= 256 and args.max_frames >= 1):
-        raise InputError('--workers is between 1 and 256, --max-frames at least 1')
     try:
         import distributed  # noqa: F401
     except ImportError:

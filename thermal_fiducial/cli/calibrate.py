@@ -15,6 +15,7 @@ from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import tracked
+from thermal_fiducial.cli.ranges import IMU_NOISE
 from thermal_fiducial.cli.subcommands import add_remap, file_to_write
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
@@ -77,7 +78,9 @@ def _add_camera_imu(parser: Parser) -> None:
         ('accelerometer_random_walk', 'm/s^3/sqrt(Hz)'),
     ):
         default = getattr(noise, name)
-        parser.add_argument('--' + name.replace('_', '-'), type=float, default=default, metavar='X', help=f'[{unit}]')
+        parser.add_argument(
+            '--' + name.replace('_', '-'), type=IMU_NOISE, default=default, metavar='X', help=f'[{unit}]'
+        )
     add_remap(parser)
 
 

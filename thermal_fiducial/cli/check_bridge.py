@@ -8,6 +8,7 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from thermal_fiducial.cli.parser import Parser
+from thermal_fiducial.cli.ranges import LISTEN_S
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.bridge_check import check_bridge, Finding, Level
 from thermal_fiducial.report.bridge_links import check_links
@@ -31,7 +32,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument('recording', nargs='?', type=Path, metavar='RECORDING', help='bag or run folder; none: listen')
     parser.add_argument('--topic', default='', help='odometry to check (default: what pose_ekf sends, as remapped)')
     parser.add_argument('--imu', type=Path, metavar='BAG', help='bag with imu/data (default: RECORDING itself)')
-    parser.add_argument('--seconds', type=float, default=15.0, help='how long to listen [s]')
+    parser.add_argument('--seconds', type=LISTEN_S, default=15.0, help='how long to listen [s]')
     parser.add_argument(
         '--ros-args', nargs=argparse.REMAINDER, default=[], help='remaps and the like, as for any node; last'
     )
@@ -69,8 +70,6 @@ def _line(finding: Finding) -> str:
 
 
 def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> 'tuple[BridgeRecord, Links]':
-    if not 0.0 < seconds < 3600.0:
-        raise InputError(f'--seconds {seconds:g}: between 0 and 3600')
     try:
         from thermal_fiducial.ros.watching.bridge_listener import listen, Topics
     except ImportError as error:

@@ -11,6 +11,7 @@ from typing import Any, TYPE_CHECKING
 from thermal_fiducial.cli.evaluate import make_video, print_tables
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
+from thermal_fiducial.cli.ranges import FLIGHT_S
 from thermal_fiducial.cli.subcommands import whole_number
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.packages import is_installed, require_plots
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 SCENARIO = 'fog'
 BAG = 'flight_through_fog'
-LONGEST_S = 3600.0
 #: Marker file in the folder of a demo: no other folder is replaced.
 MARK = '.thermal_fiducial_demo'
 #: ROS packages that the replay imports.
@@ -32,7 +32,7 @@ ROS_PACKAGES = ('rclpy', 'sensor_msgs', 'geometry_msgs', 'diagnostic_msgs')
 def add_arguments(parser: Parser) -> None:
     """Options of the command."""
     parser.add_argument('--out', type=Path, default=Path('runs/demo'), metavar='RUN', help='folder')
-    parser.add_argument('--seconds', type=float, default=30.0, help='length of the flight [s], 11 or more')
+    parser.add_argument('--seconds', type=FLIGHT_S, default=30.0, help='length of the flight [s], 11 or more')
     parser.add_argument('--seed', type=whole_number(0), default=0, help='seed of path and noise')
     parser.add_argument('--picture', type=Path, metavar='PNG', help='also draw frame, map and error into one picture')
     parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
@@ -40,8 +40,6 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate a flight, replay it, evaluate it, write the report."""
-    if not 0.0 < args.seconds <= LONGEST_S:
-        raise InputError(f'--seconds {args.seconds:g} is not between 0 and {LONGEST_S:g}')
     _check_packages(args)
     from thermal_fiducial.sim.thermal_camera import plan
 

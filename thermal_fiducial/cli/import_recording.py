@@ -8,12 +8,12 @@ import numpy as np
 
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
+from thermal_fiducial.cli.ranges import CORNER_PX, LATE_S, SIDE_M
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import STORAGES
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.flight_bags import frame_count, write_recording
 from thermal_fiducial.files.recordings import read_recording
-from thermal_fiducial.files.rig_files import LARGEST_MARKER_M
 from thermal_fiducial.files.work_folders import made_whole
 
 #: Usual error of corners in pictures of visible light [px].
@@ -37,17 +37,17 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument('--camchain', type=Path, metavar='YAML', help="Kalibr's camchain (default: in the folder)")
     parser.add_argument('--imu', type=Path, metavar='YAML', help="Kalibr's IMU file (default: in the folder)")
     parser.add_argument(
-        '--marker-size', type=float, metavar='M', help='side of the markers, for corners [m] (default: of rig.yaml)'
+        '--marker-size', type=SIDE_M, metavar='M', help='side of the markers, for corners [m] (default: of rig.yaml)'
     )
     parser.add_argument('--dictionary', metavar='NAME', help='dictionary of the markers (default: of rig.yaml)')
     parser.add_argument(
         '--sigma-px',
-        type=float,
+        type=CORNER_PX,
         help=f'standard deviation of corners without one of their own [px] (default: {_SIGMA_PX:g})',
     )
     parser.add_argument(
         '--late',
-        type=float,
+        type=LATE_S,
         default=0.0,
         metavar='S',
         help='time from the stamp of a frame until it comes [s] (default: 0)',
@@ -59,10 +59,6 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the recording, write the bag, print how to replay it."""
-    if args.marker_size is not None and not 0.0 < args.marker_size <= LARGEST_MARKER_M:
-        raise InputError(f'--marker-size {args.marker_size:g} is not between 0 and {LARGEST_MARKER_M:g} m')
-    if not (0.0 < (args.sigma_px or _SIGMA_PX) < 100.0 and 0.0 <= args.late < 10.0):
-        raise InputError('--sigma-px is between 0 and 100, --late between 0 and 10')
     recording = read_recording(args.folder, args.camera, args.camchain, args.imu)
     rig = recording.rig
     if args.marker_size is not None:

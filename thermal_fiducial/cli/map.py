@@ -11,7 +11,7 @@ import numpy as np
 from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
 from thermal_fiducial.cli.marker_sizes import add_sizes, join_sizes
 from thermal_fiducial.cli.parser import add_command, Commands, Parser
-from thermal_fiducial.cli.ranges import SIGMA_DEG, SIGMA_M
+from thermal_fiducial.cli.ranges import COORDINATE_M, MARKER_ID, QUATERNION, SIGMA_DEG, SIGMA_M
 from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
@@ -52,7 +52,7 @@ def add_arguments(parser: Parser) -> None:
         action = _command(
             commands, name, f'declare markers {"fixed, so that they never move" if fixed else "free to move"}', _fix
         )
-        action.add_argument('ids', type=int, nargs='+', metavar='ID', help='markers of the map')
+        action.add_argument('ids', type=MARKER_ID, nargs='+', metavar='ID', help='markers of the map')
         action.set_defaults(fixed=fixed)
     _add_editing(commands)
     _command(commands, 'history', 'earlier versions of a map', _history)
@@ -85,20 +85,27 @@ def _command(commands: Commands, name: str, text: str, do: Callable[[argparse.Na
 
 def _add_editing(commands: Commands) -> None:
     move = _command(commands, 'move', 'set the pose of a marker', _move)
-    move.add_argument('id', type=int, metavar='ID', help='marker of the map')
+    move.add_argument('id', type=MARKER_ID, metavar='ID', help='marker of the map')
     move.add_argument(
-        '--position', type=float, nargs=3, required=True, metavar=('X', 'Y', 'Z'), help='position of its centre [m]'
+        '--position',
+        type=COORDINATE_M,
+        nargs=3,
+        required=True,
+        metavar=('X', 'Y', 'Z'),
+        help='position of its centre [m]',
     )
-    move.add_argument('--orientation', type=float, nargs=4, metavar=('QX', 'QY', 'QZ', 'QW'), help='default: as it is')
+    move.add_argument(
+        '--orientation', type=QUATERNION, nargs=4, metavar=('QX', 'QY', 'QZ', 'QW'), help='default: as it is'
+    )
     move.add_argument('--sigma', type=SIGMA_M, default=0.005, metavar='M', help='standard deviation of the position')
     move.add_argument(
         '--sigma-deg', type=SIGMA_DEG, default=1.0, metavar='DEG', help='standard deviation of the orientation'
     )
     rename = _command(commands, 'rename', 'give a marker another ID', _rename)
-    rename.add_argument('old', type=int, metavar='OLD', help='ID that it has')
-    rename.add_argument('new', type=int, metavar='NEW', help='ID that no other marker has')
+    rename.add_argument('old', type=MARKER_ID, metavar='OLD', help='ID that it has')
+    rename.add_argument('new', type=MARKER_ID, metavar='NEW', help='ID that no other marker has')
     delete = _command(commands, 'delete', 'remove markers', _delete)
-    delete.add_argument('ids', type=int, nargs='+', metavar='ID', help='markers of the map')
+    delete.add_argument('ids', type=MARKER_ID, nargs='+', metavar='ID', help='markers of the map')
     merge = _command(commands, 'merge', 'add the markers of another map, aligned by the markers in common', _merge)
     merge.add_argument('other', type=Path, metavar='OTHER', help='map file with markers in common')
     merge.add_argument('--out', type=file_to_write, metavar='FILE', help='default: MAP itself')
@@ -176,8 +183,6 @@ def _fix(args: argparse.Namespace) -> int:
 
 
 def _move(args: argparse.Namespace) -> int:
-    if not np.all(np.isfinite(args.position)):
-        raise InputError('--position is not three finite numbers')
     if args.orientation and not 0.9 < float(np.linalg.norm(args.orientation)) < 1.1:
         raise InputError('--orientation is no unit quaternion x y z w')
     covariance = np.diag([args.sigma**2 / 3.0] * 3 + [np.deg2rad(args.sigma_deg) ** 2 / 3.0] * 3)

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from thermal_fiducial.cli.parser import Parser
+from thermal_fiducial.cli.ranges import COORDINATE_M, REACH_M
 from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.se3 import apply, inverse, quaternion_from_rotation, transform_from_quaternion
@@ -26,13 +27,13 @@ def add_align(parser: Parser) -> None:
     parser.add_argument('--cloud', type=Path, required=True, metavar='FILE', help='point cloud, .ply or .pcd')
     parser.add_argument(
         '--initial',
-        type=float,
+        type=COORDINATE_M,
         nargs=7,
         default=[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
         metavar=('X', 'Y', 'Z', 'QX', 'QY', 'QZ', 'QW'),
         help='rough pose of the map in the cloud (default: the same frame)',
     )
-    parser.add_argument('--reach', type=float, default=0.5, metavar='M', help='how rough that may be')
+    parser.add_argument('--reach', type=REACH_M, default=0.5, metavar='M', help='how rough that may be')
     parser.add_argument('--out', type=file_to_write, metavar='YAML', help='file for the transform')
     parser.add_argument('--plot', type=file_to_write, metavar='PNG', help='draw map and cloud into a picture')
     parser.set_defaults(do=_align)

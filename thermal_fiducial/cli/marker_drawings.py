@@ -11,7 +11,7 @@ import numpy as np
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.ranges import LENGTH_MM
+from thermal_fiducial.cli.ranges import BOARD_POINTS, CELLS, LENGTH_MM
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
@@ -89,7 +89,7 @@ def add_board(parser: Parser) -> None:
     parser.set_defaults(do=_board)
     parser.add_argument('kind', choices=('circles', 'markers'), help='one stencil of holes, or markers on a base plate')
     parser.add_argument(
-        '--grid', type=int, nargs=2, metavar=('COLUMNS', 'ROWS'), help='default: 4 11 circles, 4 3 markers'
+        '--grid', type=BOARD_POINTS, nargs=2, metavar=('COLUMNS', 'ROWS'), help='default: 4 11 circles, 4 3 markers'
     )
     parser.add_argument(
         '--spacing', type=LENGTH_MM, metavar='MM', help='default: 25 between rows of circles, 40 between markers'
@@ -159,9 +159,9 @@ def add_plate_options(parser: Parser, size: float = PlateOptions.size, without: 
             parser.set_defaults(**{name: getattr(PlateOptions, name)})
             continue
         default = size if name == 'size' else getattr(PlateOptions, name)
-        group.add_argument(_option(name), type=float, default=default, metavar='MM', help=description)
+        group.add_argument(_option(name), type=LENGTH_MM, default=default, metavar='MM', help=description)
     group.add_argument(
-        '--quiet-cells', type=float, default=1.0, metavar='CELLS', help='width of the warm ring around the pattern'
+        '--quiet-cells', type=CELLS, default=1.0, metavar='CELLS', help='width of the warm ring around the pattern'
     )
     group.add_argument(
         '--min-web', type=LENGTH_MM, default=3.0, metavar='MM', help='least width of acrylic between holes'

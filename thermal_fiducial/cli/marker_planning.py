@@ -16,11 +16,13 @@ from thermal_fiducial.cli.ranges import (
     DISTANCE_M,
     FOG_PER_M,
     GAP_MM,
+    LENGTH_MM,
     LENS_MM,
     LOSS,
     NETD_K,
+    TILT_DEG,
 )
-from thermal_fiducial.cli.subcommands import file_to_write, number, whole_number
+from thermal_fiducial.cli.subcommands import file_to_write, whole_number
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
@@ -56,19 +58,19 @@ def add_plan(parser: Parser) -> None:
     parser.set_defaults(do=_plan)
     camera = parser.add_argument_group('camera')
     camera.add_argument('--calibration', type=Path, help='camera_info YAML (default: the --lens of a Tau 2)')
-    camera.add_argument('--lens', type=float, default=13.0, metavar='MM', help='focal length, without a calibration')
+    camera.add_argument('--lens', type=LENS_MM, default=13.0, metavar='MM', help='focal length, without a calibration')
     camera.add_argument('--netd', type=NETD_K, default=0.05, metavar='K', help='temporal noise of the camera')
     marker = parser.add_argument_group('marker')
-    marker.add_argument('--size', type=float, default=300.0, metavar='MM', help='side of the black square')
+    marker.add_argument('--size', type=LENGTH_MM, default=300.0, metavar='MM', help='side of the black square')
     marker.add_argument('--bits', type=BITS, default=4, help='bits along a side of the dictionary')
-    marker.add_argument('--thickness', type=float, default=3.0, metavar='MM', help='thickness of the acrylic')
+    marker.add_argument('--thickness', type=LENGTH_MM, default=3.0, metavar='MM', help='thickness of the acrylic')
     marker.add_argument(
         '--stand-off', type=GAP_MM, default=10.0, metavar='MM', help='air gap between warm surface and sheet'
     )
     scene = parser.add_argument_group('scene')
     scene.add_argument(
         '--contrast',
-        type=number(*CONTRAST_K, 'K'),
+        type=CONTRAST_K,
         default=15.0,
         metavar='K',
         help='temperature of the warm surface above that of the room',
@@ -85,12 +87,14 @@ def add_plan(parser: Parser) -> None:
     )
     scene.add_argument(
         '--fog',
-        type=number(*FOG_PER_M, '1/m'),
+        type=FOG_PER_M,
         default=0.0,
         metavar='1/M',
         help='extinction in the long-wave infrared',
     )
-    scene.add_argument('--tilt', type=float, default=30.0, metavar='DEG', help='angle between normal and line of sight')
+    scene.add_argument(
+        '--tilt', type=TILT_DEG, default=30.0, metavar='DEG', help='angle between normal and line of sight'
+    )
     scene.add_argument('--distances', default='1,1.5,2,3,4,6,8,12', metavar='LIST', help='distances [m]')
     parser.add_argument('--plot', type=file_to_write, metavar='FILE', help='picture of both tables (PNG, PDF, SVG)')
     parser.add_argument(
@@ -136,9 +140,6 @@ def _numbers(text: str) -> list[float]:
 def _camera(args: argparse.Namespace) -> Camera:
     if args.calibration is not None:
         return load_camera(args.calibration)
-    shortest, longest = LENS_MM
-    if not shortest <= args.lens <= longest:
-        raise InputError(f'--lens {args.lens:g} mm is no focal length: in millimetres, {shortest:g} to {longest:g}')
     focal = args.lens / _PITCH_MM
     return Camera(640, 512, np.array([[focal, 0.0, 319.5], [0.0, focal, 255.5], [0.0, 0.0, 1.0]]))
 

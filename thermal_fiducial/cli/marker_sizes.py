@@ -3,7 +3,7 @@
 import argparse
 
 from thermal_fiducial.cli.parser import Parser
-from thermal_fiducial.cli.ranges import SIDE_M
+from thermal_fiducial.cli.ranges import PLATE_M, SIDE_M
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.errors import InputError
 
@@ -12,7 +12,7 @@ def add_sizes(parser: Parser, *, behind: bool = False, without: str = 'none') ->
     """Add the options to a command, or to one of its actions (``behind``); ``without``: the side if none is given."""
     size = argparse.SUPPRESS if behind else None
     text = f'side of markers whose entry has none [m] (default: {without})'
-    parser.add_argument('--marker-size', type=_side, default=size, metavar='M', help=text)
+    parser.add_argument('--marker-size', type=SIDE_M, default=size, metavar='M', help=text)
     # The parser of an action begins with empty lists, and would overwrite those of the command under the same name.
     parser.add_argument(
         '--marker-size-override',
@@ -29,7 +29,7 @@ def add_thickness(parser: Parser) -> None:
     """Add the option for the thickness of the plates, as the nodes have it."""
     parser.add_argument(
         '--plate-thickness',
-        type=float,
+        type=PLATE_M,
         default=0.0,
         metavar='M',
         help='thickness of the plates, if they are cut from acrylic [m] (default: 0)',
@@ -39,17 +39,6 @@ def add_thickness(parser: Parser) -> None:
 def join_sizes(args: argparse.Namespace) -> None:
     """Join the overrides of both places in ``args.marker_size_override``; for a marker the last one holds."""
     args.marker_size_override = [*args.sizes_before, *args.sizes_behind]
-
-
-def _side(text: str) -> float:
-    try:
-        side = float(text)
-    except ValueError:
-        side = 0.0
-    least, most = SIDE_M
-    if not least <= side <= most:
-        raise argparse.ArgumentTypeError(f'{text!r} is no side in metres')
-    return side
 
 
 def _override(text: str) -> str:

@@ -7,6 +7,7 @@ from thermal_fiducial.cli import marker_drawings, marker_planning
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.ranges import BITS, HAMMING, LENGTH_MM
 from thermal_fiducial.cli.subcommands import file_to_write, whole_number
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.detection.patterns import Dictionary
@@ -82,8 +83,8 @@ def _check(args: argparse.Namespace) -> int:
 def _add_bridge(parser: Parser) -> None:
     parser.set_defaults(do=_bridge)
     add_choice(parser)
-    parser.add_argument('--size', type=float, default=300.0, metavar='MM', help='side of the black square')
-    parser.add_argument('--bridge-width', type=float, default=4.0, metavar='MM', help='width of a web')
+    parser.add_argument('--size', type=LENGTH_MM, default=300.0, metavar='MM', help='side of the black square')
+    parser.add_argument('--bridge-width', type=LENGTH_MM, default=4.0, metavar='MM', help='width of a web')
 
 
 def _bridge(args: argparse.Namespace) -> int:
@@ -107,8 +108,8 @@ def _add_dictionary(parser: Parser) -> None:
     parser.add_argument(
         'out', type=file_to_write, help="dictionary file to write (YAML); its name becomes the dictionary's"
     )
-    parser.add_argument('--bits', type=int, default=4, help='bits along a side')
-    parser.add_argument('--distance', type=int, default=4, help='least Hamming distance')
+    parser.add_argument('--bits', type=BITS, default=4, help='bits along a side')
+    parser.add_argument('--distance', type=HAMMING, default=4, help='least Hamming distance')
     parser.add_argument(
         '--count', type=whole_number(1), help='number of markers to keep, the stiffest first (default: all)'
     )

@@ -9,6 +9,7 @@ import time
 
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.ranges import RATE
 from thermal_fiducial.cli.subcommands import add_remap
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import parse_remaps
@@ -39,7 +40,7 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument(
         '--rate',
-        type=float,
+        type=RATE,
         metavar='X',
         help='speed of --transport processes, in multiples of real time (default: 1)',
     )
@@ -66,8 +67,6 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay the bag, write the run folder, print a summary."""
-    if args.rate is not None and not 0.0 < args.rate <= 100.0:
-        raise InputError(f'--rate {args.rate:g} is not between 0 and 100')
     refuse_other_folder(args.out)
     _check_packages(report=not args.no_report, video=args.video)
     replay = importlib.import_module('thermal_fiducial.replay.session')

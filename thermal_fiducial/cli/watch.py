@@ -8,6 +8,7 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from thermal_fiducial.cli.parser import Parser
+from thermal_fiducial.cli.ranges import LISTEN_S
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.watching.live_status import Advice, LiveState, LiveStatus
 
@@ -29,7 +30,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         '--once', action='store_true', help='show the state once and end; exit status 1 unless the pose may be flown on'
     )
-    parser.add_argument('--wait', type=float, default=3.0, help='with --once: time to listen before [s]')
+    parser.add_argument('--wait', type=LISTEN_S, default=3.0, help='with --once: time to listen before [s]')
     parser.add_argument('--plain', action='store_true', help='lines of plain text, no screen')
     parser.add_argument(
         '--ros-args', nargs=argparse.REMAINDER, default=[], help='remaps and the like, as for any node; last'
@@ -39,8 +40,6 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show the state until interrupted."""
-    if not 0.0 < args.wait < 3600.0:
-        raise InputError(f'--wait {args.wait:g}: between 0 and 3600')
     try:
         from thermal_fiducial.ros.watching.watcher import watch
     except ImportError as error:

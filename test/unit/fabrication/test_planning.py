@@ -224,7 +224,7 @@ def test_command_prints_tables_and_draws(tmp_path, capsys):
     assert main(['markers', 'plan', '--thickness', '0']) == 2
 
 
-@pytest.mark.parametrize('words', [('--size', '0.3'), ('--lens', '0.013'), ('--thickness', '0.003')])
+@pytest.mark.parametrize('words', [('--size', '0.3'), ('--thickness', '0.003')])
 def test_lengths_in_metres_are_refused(capsys, words):
     assert main(['markers', 'plan', *words]) == 2
     assert f'{words[1]} mm' in capsys.readouterr().err

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from support import small_bag
+from support.commands import status
 import yaml
 
 from thermal_fiducial.cli.main import main
@@ -255,7 +256,8 @@ def test_what_is_no_file_is_not_taken_for_nothing(ours, capsys, name):
 
 @pytest.mark.parametrize('options', [('--marker-size', 'nan'), ('--marker-size', '-1'), ('--camchain', 'chain.yaml')])
 def test_options_that_cannot_be_used(ours, capsys, options):
-    assert run(ours, *options) == 2
+    words = ['import', ours, '--out', ours.parent / 'bag', *options]
+    assert status(words) == 2
     assert options[0] in capsys.readouterr().err
 
 

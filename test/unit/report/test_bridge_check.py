@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rosbags.typesys import get_typestore, Stores
+from support.commands import status
 from support.flights import Motion
 
 from thermal_fiducial.cli.main import main
@@ -185,7 +186,7 @@ def test_messages_become_the_record(flying):
 def test_the_command_wants_something_to_check(tmp_path, capsys):
     assert main(['check-bridge', str(tmp_path / 'nothing')]) == 2
     assert 'no such bag' in capsys.readouterr().err
-    assert main(['check-bridge', '--seconds', '-1']) == 2
+    assert status(['check-bridge', '--seconds', '-1']) == 2
 
 
 def test_a_recorded_run_is_checked(tmp_path, flying, capsys):

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.commands import status
 from support.tiny import TINY
 import yaml
 
@@ -291,15 +292,15 @@ def test_command_follows_a_trajectory(tiny_scenario, tmp_path):
         (['--scenario', 'moon'], 'moon'),
         (['--lens', '3mm'], '3mm'),
         (['--seconds', '1'], 'too short'),
-        (['--seconds', 'nan'], '--seconds nan is outside'),
-        (['--seed', '-1'], '--seed -1'),
-        (['--time-offset', '2'], '--time-offset 2.0'),
-        (['--frame-rate', '0'], '--frame-rate 0.0'),
+        (['--seconds', 'nan'], "argument --seconds: 'nan' is not"),
+        (['--seed', '-1'], "argument --seed: '-1' is not"),
+        (['--time-offset', '2'], "argument --time-offset: '2' is not"),
+        (['--frame-rate', '0'], "argument --frame-rate: '0' is not"),
         (['--trajectory', 'nowhere.tum'], 'nowhere.tum'),
     ],
 )
 def test_command_refuses_in_one_line(tmp_path, capsys, options, says):
-    assert main(['simulate', str(tmp_path / 'bag'), '--workers', '1', *options]) == 2
+    assert status(['simulate', tmp_path / 'bag', '--workers', '1', *options]) == 2
     error = capsys.readouterr().err.strip().splitlines()[-1]
     assert says in error
     assert list(tmp_path.iterdir()) == []
