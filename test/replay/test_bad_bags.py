@@ -64,7 +64,9 @@ def test_a_corrupt_bag(replay, recording, tmp_path, storage, damage):
 
 def test_a_folder_that_is_no_bag(replay, tmp_path):
     (tmp_path / 'folder').mkdir()
-    fails(replay(tmp_path / 'folder'), 'folder')
+    fails(replay(tmp_path / 'folder'), 'folder', 'neither metadata.yaml nor a file .mcap, .db3, .bag')
+    (tmp_path / 'folder' / 'flight_0.mcap').touch()
+    fails(replay(tmp_path / 'folder'), 'folder', 'no metadata.yaml (ros2 bag reindex makes one)')
 
 
 @pytest.mark.parametrize('topic', [IMAGE_TOPIC, IMU_TOPIC, CAMERA_INFO_TOPIC])
@@ -142,7 +144,7 @@ def uncalibrated(message):
     [
         (IMAGE_TOPIC, cut_short, '640x512'),
         (IMU_TOPIC, nan, 'not finite'),
-        (CAMERA_INFO_TOPIC, uncalibrated, 'calibration'),
+        (CAMERA_INFO_TOPIC, uncalibrated, 'without a focal length: the camera is not calibrated'),
     ],
 )
 def test_nothing_but_bad_messages(replay, recording, tmp_path, topic, damage, word):

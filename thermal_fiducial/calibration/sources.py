@@ -18,6 +18,7 @@ from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 from thermal_fiducial.files.images import read_picture as load_picture
+from thermal_fiducial.files.reading import naming
 
 #: Columns of a file of measured points; a header may hold more.
 POINT_COLUMNS = ('view', 'point', 'u', 'v', 'x', 'y')
@@ -115,7 +116,8 @@ def clean_frames(bag: BagReader) -> Iterator[RawFrame]:
     cleaner = FrameCleaner(Tau2CameraConfig())
     for index, entry in enumerate(bag.messages([bag.image_topic])):
         stamp_ns = stamp_to_ns(entry.message.header.stamp)
-        frame = cleaner.process(stamp_ns, image_to_array(entry.message))
+        with naming(bag.path):
+            frame = cleaner.process(stamp_ns, image_to_array(entry.message))
         if frame.counts is not None:
             yield RawFrame(str(index), stamp_ns, frame.counts)
 
@@ -130,7 +132,8 @@ def recorded_camera(bag: BagReader) -> Camera:
     """
     bag.require({CAMERA_INFO_TOPIC: _INFO_TYPE})
     info = next(bag.messages([CAMERA_INFO_TOPIC])).message
-    return Camera(int(info.width), int(info.height), np.array(info.k), str(info.distortion_model), np.array(info.d))
+    with naming(bag.path):
+        return Camera(int(info.width), int(info.height), np.array(info.k), str(info.distortion_model), np.array(info.d))
 
 
 def imu_track(bag: BagReader) -> tuple[ImuTrack, int]:

@@ -134,6 +134,8 @@ def _has_corners_only(bag: BagReader) -> bool:
 def _detected_rows(bag: BagReader, detector: MarkerDetector, camera: Camera) -> Iterator[tuple[int, Markers]]:
     """Stamps and detections of the frames of a bag."""
     for frame in tracked(clean_frames(bag), 'finding markers', bag.message_count([bag.image_topic])):
+        with naming(bag.path):
+            camera.require_size_of(frame.counts)
         yield frame.stamp_ns, detector.detect(frame.stamp_ns, frame.counts, camera)
 
 

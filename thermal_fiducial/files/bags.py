@@ -126,6 +126,13 @@ def parse_remaps(arguments: Iterable[str]) -> dict[str, str]:
     return remaps
 
 
+def _what_is_missing(folder: Path) -> str:
+    """What keeps a folder from being a bag, with the remedy if there is one."""
+    if any(file.suffix in SINGLE_FILES for file in folder.iterdir()):
+        return 'no metadata.yaml (ros2 bag reindex makes one)'
+    return f'neither metadata.yaml nor a file {", ".join(SINGLE_FILES)}'
+
+
 class BagReader:
     """A recorded bag, a context manager.
 
@@ -154,7 +161,7 @@ class BagReader:
         if not self.path.is_dir() and self.path.suffix not in SINGLE_FILES:
             raise InputError(f'{self.path}: no bag: neither a folder nor a file {", ".join(SINGLE_FILES)}')
         if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
-            raise InputError(f'{self.path}: no bag, the folder has no metadata.yaml (ros2 bag reindex makes one)')
+            raise InputError(f'{self.path}: no bag, the folder has {_what_is_missing(self.path)}')
         if self.path.is_dir():
             check_metadata(self.path / 'metadata.yaml')
         for file in sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]:

@@ -226,13 +226,20 @@ def _report_refusals(files: RunFiles, entry: Entry, nodes: Sequence[str], warn: 
         refused, reason = int(figures.get('refused messages', 0)), figures.get('last refusal', '')
         if figures.get('calibrations') == '0':
             topic = f'{node.rpartition("/")[0]}/{CAMERA_INFO_TOPIC}'.lstrip('/')
-            raise InputError(f'not one message on {topic} holds a usable calibration')
+            raise InputError(f'not one message on {topic} holds a usable calibration{_why_not(files, topic)}')
         # An internal error of the node is not a fault of the input.
         for topic in [] if reason.startswith(INTERNAL_ERROR) else needed.get(node, []):
             if refused and refused >= int(figures[f'received /{topic}']):
                 raise InputError(f'not one message on {topic} could be used: {reason}')
         if refused:
             warn(f'{node}: {refused} messages refused, the last one: {reason}')
+
+
+def _why_not(files: RunFiles, topic: str) -> str:
+    """The last refusal of a message on ``topic`` by any node, as others follow it in those that have images."""
+    name = topic.rpartition('/')[2]
+    last = (figures.get('last refusal', '') for figures in files.figures.values())
+    return next((f': {reason}' for reason in last if reason.startswith(f'{name}: ')), '')
 
 
 def _summary(options: Options, settings: Settings, bag: BagReader, played: Topics, files: RunFiles) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from support.small_bag import (
     Raw,
     Recording,
     recording,
+    replaced,
     side_files,
     START_NS,
     T_BODY_CAMERA,
@@ -100,6 +101,22 @@ def test_camera_against_imu_refuses_a_calibration_of_another_size(tmp_path, caps
     words = ['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--calibration', str(lens)]
     assert main([*words, '--out', str(out)]) == 2
     assert 'lens.yaml: a calibration of 320x256 pixels, the bag of 640x512' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('topic', 'fields', 'words'),
+    [
+        (CAMERA_INFO_TOPIC, {'k': np.zeros(9)}, 'camera matrix without a focal length'),
+        (IMAGE_TOPIC, {'encoding': 'bgr8'}, "image of encoding 'bgr8'"),
+        (CAMERA_INFO_TOPIC, {'width': 320, 'height': 256}, 'image of 640x512, camera_info of 320x256'),
+    ],
+)
+def test_camera_against_imu_names_the_bag_of_what_it_cannot_use(tmp_path, topic, fields, words, capsys):
+    recorded = recording(seconds=0.2).changed(topic, lambda message: replaced(message, **fields))
+    marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
+    command = ['calibrate', 'camera-imu', str(recorded.write(tmp_path / 'bag')), '--map', str(marker_map)]
+    assert main([*command, '--out', str(tmp_path / 'extrinsics.yaml')]) == 2
+    assert f'{tmp_path}/bag: {words}' in capsys.readouterr().err
 
 
 def _axes_of(text, name):

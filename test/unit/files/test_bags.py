@@ -166,7 +166,7 @@ def test_missing_bag(tmp_path):
 
 
 def test_folder_without_metadata(tmp_path):
-    with pytest.raises(InputError, match=r'no metadata\.yaml'):
+    with pytest.raises(InputError, match=r'neither metadata\.yaml nor a file'):
         read_all(tmp_path)
 
 
