@@ -74,6 +74,16 @@ def test_images_cannot_be_recorded_where_no_node_has_them(folder, words, capfd):
     assert '--images has no effect with input from' in capfd.readouterr().err
 
 
+def test_a_video_of_a_bag_without_images_is_refused_before_the_replay(folder, tmp_path, monkeypatch, capfd):
+    # An encoder, if there is none on this machine.
+    monkeypatch.setattr('thermal_fiducial.report.video.require_encoder', lambda: 'av')
+    run = tmp_path / 'run'
+    words = ['replay', folder / 'markers', '--out', run, '--map', folder / 'map.yaml', '--no-report', '--video']
+    assert main([str(word) for word in words]) == 2
+    assert '--video has no effect with' in capfd.readouterr().err
+    assert not run.exists()
+
+
 def test_what_is_missing_is_named(folder, tmp_path, capfd):
     recorded = small_bag.recording(seconds=0.2).without('thermal/image_raw')
     recorded.write(tmp_path / 'bag')

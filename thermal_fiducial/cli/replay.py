@@ -12,7 +12,7 @@ from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import RATE
 from thermal_fiducial.cli.subcommands import add_remap
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
-from thermal_fiducial.files.bags import parse_remaps
+from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.replay.earlier_runs import refuse_other_folder
 
 
@@ -69,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
     """Replay the bag, write the run folder, print a summary."""
     refuse_other_folder(args.out)
     _check_packages(report=not args.no_report, video=args.video)
+    if args.video:
+        _require_images(args.bag, parse_remaps(args.remap))
     replay = importlib.import_module('thermal_fiducial.replay.session')
     options = replay.Options(
         bag=args.bag,
@@ -113,6 +115,13 @@ def _check_packages(*, report: bool, video: bool) -> None:
             raise InputError(f'{error}, or replay with --no-report') from None
     if video:
         importlib.import_module('thermal_fiducial.report.video').require_encoder()
+
+
+def _require_images(bag: Path, remaps: Mapping[str, str]) -> None:
+    """Refuse a video of a bag without images before the replay, not after it."""
+    with BagReader(bag, remaps) as reader:
+        if reader.image_topic not in reader.topics:
+            raise InputError(f'--video has no effect with {bag}, which has no images')
 
 
 def _report(run: Path) -> None:
