@@ -166,18 +166,26 @@ class CameraFit:
         T_map_camera (B, 4, 4), robust chi squares (B,), and information (B, 6, 6) of the map in the camera, turned
         about the middle of the markers.
         """
-        starts, images = se3.inverse(T_map_camera) @ self._T_map_middle, self._images
-        if weights is not None:
-            root = np.repeat(np.sqrt(weights), 4)[:, None]
-            images = Images(images.whitening * root[..., None], images.target * root)
+        starts, images = se3.inverse(T_map_camera) @ self._T_map_middle, self._weighted(weights)
         T_camera_middle, chi2, information = minimise(
             starts, lambda T: evaluate(T, self._points, images, inlier), alternatives=len(starts)
         )
         return self._T_map_middle @ se3.inverse(T_camera_middle), chi2, information
 
-    def costs(self, T_map_camera: FloatArray) -> FloatArray:
-        """Robust chi squares (B,) at camera poses (B, 4, 4), inf where a marker would be behind the camera."""
-        return costs(se3.inverse(T_map_camera) @ self._T_map_middle, self._points, self._images, INLIER)
+    def costs(self, T_map_camera: FloatArray, weights: FloatArray | None = None, inlier: float = INLIER) -> FloatArray:
+        """Robust chi squares (B,) at camera poses (B, 4, 4), inf where a marker would be behind the camera.
+
+        ``weights`` and ``inlier`` as in :meth:`solve`.
+        """
+        T_camera_middle = se3.inverse(T_map_camera) @ self._T_map_middle
+        return costs(T_camera_middle, self._points, self._weighted(weights), inlier)
+
+    def _weighted(self, weights: FloatArray | None) -> Images:
+        """The corners with factors (N,) on the information of each marker."""
+        if weights is None:
+            return self._images
+        root = np.repeat(np.sqrt(weights), 4)[:, None]
+        return Images(self._images.whitening * root[..., None], self._images.target * root)
 
 
 def ippe_square(normalised: FloatArray, sizes: FloatArray) -> FloatArray:

@@ -36,31 +36,33 @@ from thermal_fiducial.core.types import FloatArray, TINY
 DECISIVE = 20.0
 #: Extent of the markers in view [rad] beyond which perspective resolves the planar ambiguity.
 WIDE = np.deg2rad(25.0)
+# Share of the largest weight from which on a marker counts for the extent of the markers in view.
+_HEAVY = 0.3
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.
 _PROPOSERS = 4
-# Gauss-Newton steps with the joint weights of surveyed markers, after the first: more of them change no figure by a
-# hundredth, one alone leaves some a hundredth worse.
-_MORE_STEPS = 2
+# Most Gauss-Newton steps of a pose after the first, and the square of a step that is small enough, in standard
+# deviations of the pose.
+_MORE_STEPS, _SMALL_STEP = 4, 0.01
 # Standard deviation of a rotation beyond which nothing is known of it, and its linearisation means nothing [rad].
 _NOTHING_KNOWN = 1.0
 
 
 def locate(
-    stamp_ns: int, sight: Sight, camera: Camera, prior: FloatArray | None, model: SystematicErrors
+    stamp_ns: int, sight: Sight, camera: Camera, prior: CameraPose | None, model: SystematicErrors
 ) -> Location | Refusal:
     """Camera pose from N known markers.
 
     Parameters
     ----------
     sight : the markers and their corners
-    prior : (4, 4) approximate T_map_camera, which resolves the planar ambiguity; or None
+    prior : the camera by odometry or by the last frame, which resolves the planar ambiguity; or None
 
     Returns
     -------
     The location, or the reason for which there is none.
     """
     fit = CameraFit(sight.observed.corners, sight.observed.covariances, sight.points, camera)
-    hypotheses = _hypotheses(sight, prior)
+    hypotheses = _hypotheses(sight, None if prior is None else prior.T_map_camera)
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
     hypotheses = hypotheses[np.argsort(fit.costs(hypotheses), kind='stable')]
@@ -74,31 +76,61 @@ def locate(
         return Refusal(f'no camera pose explains {names(sight)}')
     # Steps 5 and 6: refined with the weights of their errors.
     found = frame.refined(T, seen, frame.weights(seen, by_map))
-    T_other = None if found is None else frame.alternative(found, hypotheses)
-    if found is None or T_other is None:
-        return found or Refusal(f'the pose from {names(sight)} is not determined')
-    return _either(frame, found, T_other, prior)
-
-
-def _either(frame: '_JointFit', found: Location, T_other: FloatArray, prior: FloatArray | None) -> Location | Refusal:
-    """Choose between two poses that the corners allow, by the prior; without one refuse, unless they nearly agree."""
-    pose = found.pose
-    T = pose.T_map_camera
-    if rotation_angle(T[:3, :3].T @ T_other[:3, :3]) < SAME_POSE:
-        spread = of_single_error(difference(T_other, T))
-        pose = replace(pose, covariance=pose.covariance + spread)
-        return replace(found, pose=pose, noise=found.noise + spread)
-    other = frame.refined(T_other, frame.sight.reprojected(frame.camera, T_other), found.weights)
-    # One that hardly fits at all ends anywhere.
-    if other is None or other.rotation_std > _NOTHING_KNOWN:
+    if found is None:
+        return Refusal(f'the pose from {names(sight)} is not determined')
+    other = frame.alternative(found, hypotheses)
+    if other is None:
         return found
-    if prior is None:
-        chi2 = frame.fit.costs(np.stack([T, other.pose.T_map_camera]))
-        chi2 *= decision_weights(frame.sight.noise_px, frame.model).min()
-        both = Viewpoint.either(found.viewpoint, other.viewpoint, chi2)
-        return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both)
-    turns = rotation_angle(prior[:3, :3].T @ np.stack([T, T_other])[:, :3, :3])
-    return other if turns[1] < turns[0] else found
+    return _either(frame, found, other, prior) if other.is_minimum else _widened(found, other)
+
+
+@dataclass(frozen=True)
+class _Alternative:
+    """Another pose that the corners of a frame do not rule out."""
+
+    #: (4, 4)
+    T_map_camera: FloatArray
+    #: by how much its chi square is larger, with the bias of the corners
+    excess: float
+    #: whether it is a solution of its own
+    is_minimum: bool
+
+
+def _widened(found: Location, other: _Alternative) -> Location:
+    """A location whose covariance has what another pose adds that is likelier than by the covariance.
+
+    Where the two planar poses merge, chi square hardly grows from one to the other; to first order it grows with the
+    square of the distance.
+    """
+    apart, covariance = difference(other.T_map_camera, found.pose.T_map_camera), found.pose.covariance
+    expected = float(apart @ np.linalg.solve(covariance, apart))
+    share = math.exp(-0.5 * other.excess) - math.exp(-0.5 * expected)
+    if share <= 0.0:
+        return found
+    spread = of_single_error(apart, math.sqrt(share))
+    return replace(found, pose=replace(found.pose, covariance=covariance + spread), noise=found.noise + spread)
+
+
+def _either(frame: '_JointFit', found: Location, other: _Alternative, prior: CameraPose | None) -> Location | Refusal:
+    """Choose between two poses that the corners allow, by the prior; refuse without one."""
+    T = other.T_map_camera
+    second = frame.refined(T, frame.sight.reprojected(frame.camera, T), found.weights)
+    # One that hardly fits at all ends anywhere.
+    if second is None or second.rotation_std > _NOTHING_KNOWN:
+        return found
+    if prior is not None:
+        return min((found, 0.0), (second, other.excess), key=lambda one: one[1] + _cost_of_turn(one[0].pose, prior))[0]
+    chi2 = frame.fit.costs(np.stack([found.pose.T_map_camera, second.pose.T_map_camera]))
+    chi2 *= decision_weights(frame.sight.noise_px, frame.model).min()
+    both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
+    return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both)
+
+
+def _cost_of_turn(pose: CameraPose, prior: CameraPose) -> float:
+    """Minus twice the logarithm of the likelihood of a camera's attitude by an independent one."""
+    turn = difference(pose.T_map_camera, prior.T_map_camera)[3:]
+    covariance = pose.covariance[3:, 3:] + prior.covariance[3:, 3:]
+    return float(turn @ np.linalg.solve(covariance, turn) + np.linalg.slogdet(covariance)[1])
 
 
 @dataclass(frozen=True)
@@ -116,11 +148,23 @@ class _JointFit:
         return np.asarray(by_map * marker_weights(seen.errors_px, self.sight.noise_px, self.model))
 
     def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
-        """One Gauss-Newton step from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
+        """Gauss-Newton steps from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
 
-        The same linearisation, in corners, map and scale, gives the covariances. None if the markers do not determine
-        the pose.
+        None if the markers do not determine the pose.
         """
+        found = self._step(T_map_camera, seen, weights)
+        for _ in range(_MORE_STEPS):
+            if found is None:
+                return None
+            T, step = found.pose.T_map_camera, difference(found.pose.T_map_camera, T_map_camera)
+            if step @ np.linalg.solve(found.pose.covariance, step) < _SMALL_STEP:
+                return found
+            T_map_camera, seen = T, self.sight.reprojected(self.camera, T)
+            found = self._step(T, seen, weights) if np.all(np.isfinite(seen.residuals)) else None
+        return found
+
+    def _step(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
+        """One Gauss-Newton step; the same linearisation, in corners, map and scale, gives the covariances."""
         n, J = len(weights), seen.J_camera.reshape(-1, 6)
         weighted, chi2 = self._weighted(seen, weights)
         try:
@@ -182,20 +226,31 @@ class _JointFit:
         pose = CameraPose(self.stamp_ns, T, covariance, of_map, ids, rms_px)
         return Location(pose, sight, seen, weights, map_gains, lens, white, of_scales, by_corner)
 
-    def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
-        """The second solution (4, 4) of the planar ambiguity if the corners do not rule it out, else None."""
-        width, height = np.ptp(self.sight.observed.corners, axis=(0, 1)) / self.camera.focal_px
-        if np.hypot(width, height) > WIDE:
-            return None
+    def alternative(self, found: Location, hypotheses: FloatArray) -> _Alternative | None:
+        """The second solution of the planar ambiguity; where it merges with the first, the likeliest pose far from it.
+
+        None if the corners rule it out.
+        """
         T = found.pose.T_map_camera
         apart = rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE
-        if not np.any(apart):
+        if self._extent(found.weights) > WIDE or not np.any(apart):
             return None
-        weights = found.weights * decision_weights(self.sight.noise_px, self.model)
-        starts = np.stack([T, hypotheses[apart][0]])
-        (T, other), chi2, _ = self.fit.solve(starts, weights, inlier=np.inf)
-        refuted = chi2[1] - chi2[0] > DECISIVE * noise_factor(float(chi2[0]), 8 * len(weights) - 6)
-        return None if refuted or np.max(np.abs(other - T)) < 1e-6 else other
+        starts, weights = hypotheses[apart], found.weights * decision_weights(self.sight.noise_px, self.model)
+        (T, other), chi2, _ = self.fit.solve(np.stack([T, starts[0]]), weights, inlier=np.inf)
+        scale = noise_factor(float(chi2[0]), 8 * len(weights) - 6)
+        if rotation_angle(T[:3, :3].T @ other[:3, :3]) > SAME_POSE:
+            excess = float(chi2[1] - chi2[0]) / scale
+            return None if excess > DECISIVE else _Alternative(other, excess, is_minimum=True)
+        turns = rotation_angle(T[:3, :3].T @ starts[:, :3, :3])
+        excesses = np.maximum(self.fit.costs(starts, weights, inlier=np.inf) - chi2[0], 0.0) / scale
+        far = int(np.argmax(turns**2 * np.exp(-0.5 * excesses)))
+        return _Alternative(starts[far], float(excesses[far]), is_minimum=False)
+
+    def _extent(self, weights: FloatArray) -> float:
+        """Angle [rad] between the corners that are farthest apart, of the markers that have most of the weight."""
+        heavy = weights >= _HEAVY * weights.max()
+        width, height = np.ptp(self.sight.observed.corners[heavy], axis=(0, 1)) / self.camera.focal_px
+        return math.hypot(width, height)
 
     def map_weights(self, T_map_camera: FloatArray) -> FloatArray:
         """Weights (N,) of the markers by their covariances in the map."""
@@ -222,18 +277,7 @@ class _SurveyedFit(_JointFit):
         by_errors = marker_weights(seen.errors_px, np.sqrt(sight.noise_px**2 + of_survey), self.model)
         return np.asarray(np.where(sight.surveyed, 1.0, by_map) * by_errors)
 
-    def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
-        """As of any fit, with more steps: joint weights move the solution."""
-        found = super().refined(T_map_camera, seen, weights)
-        for _ in range(_MORE_STEPS):
-            if found is None:
-                return None
-            T_map_camera = found.pose.T_map_camera
-            seen = self.sight.reprojected(self.camera, T_map_camera)
-            found = super().refined(T_map_camera, seen, weights) if np.all(np.isfinite(seen.residuals)) else None
-        return found
-
-    def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
+    def alternative(self, found: Location, hypotheses: FloatArray) -> _Alternative | None:
         """As of any fit; it compares corners that count as independent."""
         by_map = np.where(self.sight.surveyed, self.map_weights(found.pose.T_map_camera), 1.0)
         return super().alternative(replace(found, weights=by_map * found.weights), hypotheses)

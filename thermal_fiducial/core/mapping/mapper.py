@@ -29,12 +29,14 @@ from thermal_fiducial.core.mapping.map_data import jump, MapMarker, MapperResult
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Reason for which the map is not updated from a frame with a pose.
 CONTRADICTED = 'the known markers in view contradict the odometry'
 #: Longest time [ns] for which the last pose resolves the planar ambiguity of the next.
 CONTINUITY_NS = 300_000_000
+# Standard deviation of a robot's rates about each axis [rad/s], where nothing measures them.
+_USUAL_RATE = 0.5
 #: ID of a new marker in view to the reason, in words, for which it is not in the map yet.
 Waiting = dict[int, str]
 
@@ -130,15 +132,22 @@ class MarkerMapper:
         self, stamp_ns: int, sight: Sight, camera: Camera, predicted: PredictedCamera | None
     ) -> Location | Refusal:
         """The camera from the trusted markers in view, at least one."""
-        last = self._last
-        near = last is not None and 0 < stamp_ns - last.stamp_ns < CONTINUITY_NS
-        expected = predicted.pose if predicted is not None else last if near else None
-        T_expected = None if expected is None else expected.T_map_camera
-        fit = partial(locate, stamp_ns, camera=camera, prior=T_expected, model=self._errors)
+        expected = predicted.pose if predicted is not None else self._last_at(stamp_ns)
+        fit = partial(locate, stamp_ns, camera=camera, prior=expected, model=self._errors)
         found = fit(sight)
         if isinstance(found, Refusal) or not are_two_that_contradict(found):
             return found
         return contradicting(sight) if predicted is None else settled(found, camera, predicted.pose, fit)
+
+    def _last_at(self, stamp_ns: int) -> CameraPose | None:
+        """The last pose for a frame that follows soon, uncertain by what a robot may have turned since."""
+        last = self._last
+        if last is None or not 0 < stamp_ns - last.stamp_ns < CONTINUITY_NS:
+            return None
+        turn = _USUAL_RATE * (stamp_ns - last.stamp_ns) / SECOND_NS
+        covariance = last.covariance.copy()
+        covariance[3:, 3:] += turn**2 * np.eye(3)
+        return replace(last, covariance=covariance)
 
     @property
     def _errors(self) -> SystematicErrors:

@@ -9,7 +9,7 @@ from thermal_fiducial.core.geometry.se3 import transform
 from thermal_fiducial.core.mapping.localization import locate, marker_weights
 from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.measurements import CORNER_FIELDS, Observations
+from thermal_fiducial.core.measurements import CameraPose, CORNER_FIELDS, Observations
 
 MODEL = SystematicErrors()
 
@@ -19,6 +19,11 @@ def located(T, poses, rows, prior=None):
     marker_map = MarkerMap({key: MapMarker(key, SIZE, True, pose) for key, pose in poses.items()})
     sight = Sight.of(Observations.of(rows), marker_map)
     return locate(0, sight, CAMERA, prior, MODEL)
+
+
+def known_to(T, position_std, rotation_std):
+    """A prior."""
+    return CameraPose(0, T, np.diag(np.repeat((position_std**2, rotation_std**2), 3)))
 
 
 def test_a_marker_that_was_moved_loses_its_weight_and_hardly_moves_the_pose():
@@ -46,17 +51,50 @@ def test_the_pose_that_is_nearer_to_the_prior_settles_the_ambiguity_of_a_far_mar
     assert isinstance(unsettled, Refusal)
     assert unsettled.reason == 'planar ambiguity of marker 0 unsettled'
     for prior in unsettled.viewpoint.T_map_camera:
-        outcome = located(T, poses, rows, prior)
+        outcome = located(T, poses, rows, known_to(prior, 0.1, 0.02))
         assert isinstance(outcome, Location)
         d = difference(outcome.pose.T_map_camera, prior)
         # The fits end where a step would lower the chi square by less than a hundredth.
         assert d @ np.linalg.solve(outcome.pose.covariance, d) < 1e-2
 
 
-def test_a_second_pose_that_hardly_fits_is_not_offered():
-    """One corner is far off, as of a plate that something covers: the fit of the other branch ends anywhere."""
-    offered = []
-    # Of 3000 seeds the worst: ends at 1e8, 5e6, 2e6 rad, which broke the placement of new markers.
+def test_a_prior_counts_by_what_it_is_worth():
+    """Of two poses 20 degrees apart it chooses if it knows the attitude to a degree, not if it knows a radian."""
+    rng = np.random.default_rng(2)
+    poses = {0: wall(rng, tilt=0.0)[0]}
+    centre = poses[0][:3, 3]
+    T = look(centre + np.array([-9.0, 0.2, 0.0]), centre)
+    rows = see(T, poses, 0.3, rng)
+    likelier, other = located(T, poses, rows).viewpoint.T_map_camera
+
+    def chosen(rotation_std):
+        T_chosen = located(T, poses, rows, known_to(other, 0.1, rotation_std)).pose.T_map_camera
+        return np.linalg.norm(difference(T_chosen, likelier)) < np.linalg.norm(difference(T_chosen, other))
+
+    assert not chosen(0.02)
+    assert chosen(1.0)
+
+
+def test_a_marker_seen_from_the_front_claims_what_its_attitude_is_worth():
+    """Where both planar poses merge, chi square hardly grows from one to the other."""
+    nees = []
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        poses = {0: wall(rng, tilt=0.0)[0]}
+        centre = poses[0][:3, 3]
+        T = look(centre + np.array([-5.0, 0.0, 0.0]), centre)
+        outcome = located(T, poses, see(T, poses, 0.1, rng))
+        if isinstance(outcome, Location):
+            turn = difference(T, outcome.pose.T_map_camera)[3:]
+            nees.append(turn @ np.linalg.solve(outcome.pose.covariance[3:, 3:], turn) / 3.0)
+    # About half of the frames are unsettled. 1.07; by first-order covariances alone 1.45.
+    assert len(nees) > 100
+    assert 0.7 < np.mean(nees) < 1.2
+
+
+def test_a_pose_that_hardly_fits_is_none():
+    """One corner is far off, as of a plate that something covers: the fit ends anywhere."""
+    # Of 3000 seeds the worst: with one step of the fit the camera was 90 m away, and said 6 degrees.
     for seed in (2552, 712, 1914):
         rng = np.random.default_rng(seed)
         poses = {0: wall(rng, tilt=0.0)[0]}
@@ -64,8 +102,10 @@ def test_a_second_pose_that_hardly_fits_is_not_offered():
         T = look(centre + np.array([-4.0, rng.uniform(-1.0, 1.0), rng.uniform(-0.5, 0.5)]), centre)
         rows = see(T, poses, 0.1, rng)
         rows[CORNER_FIELDS[rng.integers(8)]][0] += rng.choice([-1.0, 1.0]) * rng.uniform(60.0, 250.0)
-        offered.append(located(T, poses, rows).viewpoint)
-    assert [len(viewpoint.poses) for viewpoint in offered] == [1, 1, 1]
+        outcome = located(T, poses, rows)
+        assert isinstance(outcome, Refusal)
+        assert outcome.viewpoint is None
+        assert outcome.reason == 'the pose from marker 0 is not determined'
 
 
 def test_weights_are_expected_over_present_variances_and_at_most_one():
@@ -85,7 +125,7 @@ def test_two_surveyed_markers_tilt_the_camera_no_more_than_each_of_them_shows():
         entries = {key: MapMarker(key, SIZE, False, pose, np.diag(stds**2)) for key, pose in surveyed.items()}
         rows = see(T, poses, 0.1, rng)
         sight = Sight.of(Observations.of(rows), MarkerMap(entries).with_assumed_draws(MODEL))
-        outcome = locate(0, sight, CAMERA, T, MODEL)
+        outcome = locate(0, sight, CAMERA, known_to(T, 0.1, 0.02), MODEL)
         assert isinstance(outcome, Location)
         distances.append(np.linalg.norm(difference(outcome.pose.T_map_camera, T)[:3]))
     # 36 mm; with corners that count as independent 191 mm. The limit lies between, nearer to what is reached.
