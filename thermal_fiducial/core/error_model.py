@@ -42,6 +42,11 @@ class SystematicErrors:
     #: its axis by as much of the distance to the markers, in maps with exact sizes too. Enters poses from markers and
     #: new markers.
     focal_length_std: float = 0.002
+    #: Error of the ratio of the two focal lengths [share of the difference between them]: pixels are square, so all of
+    #: the difference is an error of the calibration (0.3 % in a published one, of a camera whose corners show none). By
+    #: 0.3 % a marker seen from the front may look tilted by 4 degrees. Enters with the errors of the lens
+    #: (``LensErrors``).
+    aspect: float = 1.0
     #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges. To
     #: begin with, and at most, as measured on rendered flights with three lenses and 0.5 to 9 K; learned in flight from
     #: residuals that last (``CornerBias``). Enters the covariance of a joint adjustment.
@@ -51,7 +56,9 @@ class SystematicErrors:
 #: 99.9 % quantile of chi square with eight degrees of freedom, of a view of a marker.
 CHI2_OF_VIEW = 26.1
 #: For data without systematic errors: simulated corners.
-NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0)
+NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0)
+#: Focal lengths of square pixels differ by less than this share; others are of pixels that are not square.
+SQUARE_PIXELS = 0.01
 #: Errors of successive odometry poses are correlated for seconds: this many count as one.
 CORRELATED_ODOMETRY = 30.0
 #: Part of the re-projection error, by bent plates and corner bias, that is no sign of an inconsistent marker [px].

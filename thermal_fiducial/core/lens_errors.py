@@ -1,4 +1,4 @@
-"""Errors of a lens model: a smooth function of the place in the image, the same in all frames.
+"""Errors of a lens model: a smooth function of the place in the image, the same in all frames, and of its aspect ratio.
 
 A Gaussian process with a squared exponential covariance, the same for either axis, by its values at nodes over the
 image (J. Quinonero-Candela, C. Rasmussen, "A Unifying View of Sparse Approximate Gaussian Process
@@ -10,7 +10,7 @@ from zlib import crc32
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import DRAWS, SystematicErrors
+from thermal_fiducial.core.error_model import DRAWS, SQUARE_PIXELS, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 
@@ -36,16 +36,27 @@ class LensErrors:
         #: (..., I) factors of independent variables of variance one, for errors of 1 px
         self.modes: FloatArray = (columns[..., :, None] * rows[..., None, :]).reshape(*corners.shape[:-1], -1)
         self._px, self._camera = errors.corner_px, camera
+        #: (..., 2) by one standard deviation of the aspect ratio [px]
+        self._of_aspect: FloatArray = errors.aspect * _aspect(camera) * (corners - camera.principal_point)
 
     def covariance(self, gains: FloatArray) -> FloatArray:
         """Covariance (m, m) of what has derivatives ``gains`` (n, m, 2) [1/px] by the corners."""
         mixed = np.tensordot(self.modes.reshape(len(gains), -1), self._px * gains, axes=([0], [0]))
-        return np.asarray(np.tensordot(mixed, mixed, axes=([0, 2], [0, 2])))
+        of_aspect = np.tensordot(self._of_aspect.reshape(-1, 2), gains, axes=([0, 1], [0, 2]))
+        return np.asarray(np.tensordot(mixed, mixed, axes=([0, 2], [0, 2])) + np.outer(of_aspect, of_aspect))
 
     def drawn(self, chosen: slice = slice(None)) -> FloatArray:
         """The errors (..., 2, k) [px] in the ``chosen`` ones of :data:`DRAWS` draws."""
-        variables = _variables(crc32(np.ascontiguousarray(self._camera.K).tobytes()), self.modes.shape[-1])
-        return np.asarray(np.tensordot(self.modes, self._px * variables[..., chosen], axes=1))
+        lens, aspect = _variables(crc32(np.ascontiguousarray(self._camera.K).tobytes()), self.modes.shape[-1])
+        smooth = np.tensordot(self.modes, self._px * lens[..., chosen], axes=1)
+        return np.asarray(smooth + self._of_aspect[..., None] * aspect[chosen])
+
+
+def _aspect(camera: Camera) -> FloatArray:
+    """Standard deviations (2,) of the focal lengths [share]: half of their difference, with opposite signs."""
+    along, across = camera.K[0, 0], camera.K[1, 1]
+    share = abs(along - across) / (along + across)
+    return share * np.array([1.0, -1.0]) * (2.0 * share < SQUARE_PIXELS)
 
 
 def _modes(places: FloatArray, size: int, length: float) -> FloatArray:
@@ -63,8 +74,10 @@ def _nodes(size: int, length: float) -> tuple[FloatArray, FloatArray]:
 
 
 @cache
-def _variables(seed: int, modes: int) -> FloatArray:
-    """Variables (modes, 2, DRAWS) of one camera, of variance one; uncorrelated as far as there are draws."""
-    most, fewest = max(2 * modes, DRAWS), min(2 * modes, DRAWS)
+def _variables(seed: int, modes: int) -> tuple[FloatArray, FloatArray]:
+    """Variables (modes, 2, DRAWS) and (DRAWS,) of a camera, of variance one; uncorrelated as far as there are draws."""
+    count = 2 * modes + 1
+    most, fewest = max(count, DRAWS), min(count, DRAWS)
     axes = np.linalg.qr(np.random.default_rng(seed).standard_normal((most, fewest)))[0]
-    return np.asarray(np.sqrt(most) * (axes.T if fewest < DRAWS else axes).reshape(modes, 2, DRAWS))
+    variables = np.sqrt(most) * (axes.T if fewest < DRAWS else axes)
+    return variables[:-1].reshape(modes, 2, DRAWS), variables[-1]

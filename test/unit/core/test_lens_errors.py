@@ -55,3 +55,30 @@ def test_a_camera_has_one_lens():
     correlation = np.vdot(other, everywhere) / (np.linalg.norm(other) * np.linalg.norm(everywhere))
     # Two lenses, 64 draws of at least four independent values each: four standard deviations.
     assert abs(correlation) < 4.0 / np.sqrt(4 * DRAWS)
+
+
+def of_focal_lengths(along, across):
+    """The camera with these focal lengths in x and y [px]."""
+    return replace(CAMERA, K=np.array([[along, 0.0, 320.0], [0.0, across, 256.0], [0.0, 0.0, 1.0]]))
+
+
+def test_half_of_what_the_focal_lengths_differ_by_is_an_error_of_either():
+    """0.25 % of either, one too long where the other is too short."""
+    corners = np.array([[420.0, 256.0], [320.0, 356.0], [320.0, 256.0]])
+    of_aspect = replace(ERRORS, corner_px=0.0)
+    lens = LensErrors(corners, of_focal_lengths(401.0, 399.0), of_aspect)
+    expected = np.array([[0.25, 0.0], [0.0, -0.25], [0.0, 0.0]])
+    draws = lens.drawn()
+    signs = draws[0, 0] / 0.25
+    np.testing.assert_allclose(draws, expected[..., None] * signs, rtol=0.0, atol=1e-12)
+    # 64 draws, each of variance one over all of them.
+    np.testing.assert_allclose(np.mean(signs**2), 1.0, rtol=1e-12)
+    gains = np.random.default_rng(3).normal(size=(3, 6, 2))
+    moved = np.einsum('iau,iu->a', gains, expected)
+    np.testing.assert_allclose(lens.covariance(gains), np.outer(moved, moved), rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize('across', [400.0, 360.0])
+def test_pixels_that_are_square_or_clearly_not_have_no_error_of_their_aspect_ratio(across):
+    lens = LensErrors(np.full((1, 2), 100.0), of_focal_lengths(400.0, across), replace(ERRORS, corner_px=0.0))
+    assert not lens.drawn().any()
