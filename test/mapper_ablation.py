@@ -6,7 +6,7 @@ arguments: only these. Recordings are taken where ``THERMAL_FIDUCIAL_DATA`` name
 """
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 import sys
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +15,7 @@ import numpy as np
 from support.mapper_scenes import Figures, SCENES
 from support.taken_out import ablation_row, lines_of
 
+from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.mapping.localization import locate
 
 MAPPING = 'thermal_fiducial.core.mapping'
@@ -80,6 +81,12 @@ MECHANISMS = {
         ('small markers', 'chain', 'tags test_16'),
         ('localization:_JointFit.alternative',),
         {'localization:_JointFit.alternative': _ignored},
+    ),
+    'poses that nearly merge': Mechanism(
+        ('small markers', 'chain'), ('localization:_widened',), {'localization:_widened': lambda found, _: found}
+    ),
+    'error of the aspect ratio': Mechanism(
+        ('board', 'surveyed board'), (), {'mapper:SystematicErrors': partial(SystematicErrors, aspect=0.0)}
     ),
     'contradiction of odometry': Mechanism(
         ('chain', 'tags test_22'),

@@ -56,7 +56,7 @@ def _aspect(camera: Camera) -> FloatArray:
     """Standard deviations (2,) of the focal lengths [share]: half of their difference, with opposite signs."""
     along, across = camera.K[0, 0], camera.K[1, 1]
     share = abs(along - across) / (along + across)
-    return share * np.array([1.0, -1.0]) * (2.0 * share < SQUARE_PIXELS)
+    return np.asarray(share * np.array([1.0, -1.0]) * (2.0 * share < SQUARE_PIXELS))
 
 
 def _modes(places: FloatArray, size: int, length: float) -> FloatArray:

@@ -90,7 +90,7 @@ class _Alternative:
 
     #: (4, 4)
     T_map_camera: FloatArray
-    #: by how much its chi square is larger, with the bias of the corners
+    #: by how much its chi square is larger, with the bias of the corners expected
     excess: float
     #: whether it is a solution of its own
     is_minimum: bool
@@ -104,11 +104,11 @@ def _widened(found: Location, other: _Alternative) -> Location:
     """
     apart, covariance = difference(other.T_map_camera, found.pose.T_map_camera), found.pose.covariance
     expected = float(apart @ np.linalg.solve(covariance, apart))
-    share = math.exp(-0.5 * other.excess) - math.exp(-0.5 * expected)
-    if share <= 0.0:
-        return found
+    share = max(math.exp(-0.5 * other.excess) - math.exp(-0.5 * expected), 0.0)
     spread = of_single_error(apart, math.sqrt(share))
-    return replace(found, pose=replace(found.pose, covariance=covariance + spread), noise=found.noise + spread)
+    return replace(
+        found, pose=replace(found.pose, covariance=covariance + spread), noise=found.noise + spread, settled=False
+    )
 
 
 def _either(frame: '_JointFit', found: Location, other: _Alternative, prior: CameraPose | None) -> Location | Refusal:
@@ -119,7 +119,8 @@ def _either(frame: '_JointFit', found: Location, other: _Alternative, prior: Cam
     if second is None or second.rotation_std > _NOTHING_KNOWN:
         return found
     if prior is not None:
-        return min((found, 0.0), (second, other.excess), key=lambda one: one[1] + _cost_of_turn(one[0].pose, prior))[0]
+        excess = other.excess + _cost_of_turn(second.pose, prior) - _cost_of_turn(found.pose, prior)
+        return replace(found if excess > 0.0 else second, settled=abs(excess) > DECISIVE)
     chi2 = frame.fit.costs(np.stack([found.pose.T_map_camera, second.pose.T_map_camera]))
     chi2 *= decision_weights(frame.sight.noise_px, frame.model).min()
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
@@ -224,7 +225,8 @@ class _JointFit:
         ids, rms_px = tuple(sight.observed.ids.tolist()), math.sqrt(seen.errors_px @ seen.errors_px / n)
         T = retract(T_map_camera, step)
         pose = CameraPose(self.stamp_ns, T, covariance, of_map, ids, rms_px)
-        return Location(pose, sight, seen, weights, map_gains, lens, white, of_scales, by_corner)
+        linear_std = math.sqrt(covariance[3:, 3:].trace())
+        return Location(pose, sight, seen, weights, map_gains, lens, white, of_scales, by_corner, linear_std)
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> _Alternative | None:
         """The second solution of the planar ambiguity; where it merges with the first, the likeliest pose far from it.
@@ -244,7 +246,7 @@ class _JointFit:
         turns = rotation_angle(T[:3, :3].T @ starts[:, :3, :3])
         excesses = np.maximum(self.fit.costs(starts, weights, inlier=np.inf) - chi2[0], 0.0) / scale
         far = int(np.argmax(turns**2 * np.exp(-0.5 * excesses)))
-        return _Alternative(starts[far], float(excesses[far]), is_minimum=False)
+        return None if excesses[far] > DECISIVE else _Alternative(starts[far], float(excesses[far]), is_minimum=False)
 
     def _extent(self, weights: FloatArray) -> float:
         """Angle [rad] between the corners that are farthest apart, of the markers that have most of the weight."""

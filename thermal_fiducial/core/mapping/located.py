@@ -117,19 +117,14 @@ class Location:
     of_scales: FloatArray
     #: (4 N, 6, 2) derivative of the pose by each corner [1/px]
     corner_gains: FloatArray
+    #: standard deviation of the attitude to first order [rad], and whether no other pose is possible
+    linear_std: float
+    settled: bool = True
 
     @property
     def rotation_std(self) -> float:
         """Standard deviation of the attitude [rad]."""
         return math.sqrt(self.pose.covariance[3:, 3:].trace())
-
-    @cached_property
-    def reason(self) -> str:
-        """Why the pose is not published, in words; empty if it is."""
-        if self.rotation_std <= VAGUE:
-            return ''
-        listed = ', '.join(str(key) for key in self.pose.marker_ids)
-        return f'known to {math.degrees(self.rotation_std):.0f} degrees only, by marker {listed}'
 
     @property
     def viewpoint(self) -> Viewpoint:
@@ -185,7 +180,19 @@ class LocatedFrame:
     @property
     def pose(self) -> CameraPose | None:
         """To publish; None without one, or if its attitude is too uncertain."""
-        return None if isinstance(self.outcome, Refusal) or self.outcome.reason else self.outcome.pose
+        return None if isinstance(self.outcome, Refusal) or self.reason else self.outcome.pose
+
+    @cached_property
+    def reason(self) -> str:
+        """Why there is no pose to publish, in words; empty if there is one."""
+        if isinstance(self.outcome, Refusal):
+            return self.outcome.reason
+        # Odometry knows the attitude where a marker is seen from the front.
+        std = self.outcome.rotation_std if self.predicted is None else self.outcome.linear_std
+        if std <= VAGUE:
+            return ''
+        listed = ', '.join(str(key) for key in self.outcome.pose.marker_ids)
+        return f'known to {math.degrees(std):.0f} degrees only, by marker {listed}'
 
     @property
     def new(self) -> Observations:

@@ -169,8 +169,10 @@ class MarkerMapper:
             # Probably a moved or duplicated marker: an update would corrupt the map.
             waiting = dict.fromkeys(frame.new.ids.tolist(), CONTRADICTED)
         else:
-            # A pose that is too uncertain to be published settles no ambiguity.
-            self._last, updated = frame.pose or self._last, True
+            # A pose that is too uncertain to be published, or not the only possible one, settles no ambiguity.
+            if outcome.settled:
+                self._last = frame.pose or self._last
+            updated = True
             # Step 7: errors updated.
             self._bias.add(outcome)
             known, (errors, error_stds) = frame.known.markers, frame.known_errors(outcome)
@@ -186,7 +188,7 @@ class MarkerMapper:
                     changed |= placed
         self._consistency.add(frame)
         return MapperResult(
-            frame.stamp_ns, frame.pose, outcome.reason, changed, frozenset(frame.known.observed.ids.tolist()), waiting,
+            frame.stamp_ns, frame.pose, frame.reason, changed, frozenset(frame.known.observed.ids.tolist()), waiting,
             dict(self._consistency.quarantined), not self.frozen and (changed or updated),
         )  # fmt: skip
 
