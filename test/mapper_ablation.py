@@ -106,6 +106,11 @@ MECHANISMS = {
         ('marker_views:MarkerViews._choose',),
         {'mapper:MarkerMapper._without_pose': lambda self, frame, refusal: (False, {})},
     ),
+    'markers turned back': Mechanism(
+        ('small markers', 'wall'),
+        ('bundle_adjustment:_with_mirrored',),
+        {'bundle_adjustment:_with_mirrored': _ignored},
+    ),
     'two places': Mechanism(
         ('two sheets', 'tags test_16'),
         ('bundle_adjustment:two_places',),

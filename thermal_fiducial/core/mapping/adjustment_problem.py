@@ -12,7 +12,7 @@ from thermal_fiducial.core.geometry.reprojection import difference, linearise, r
 from thermal_fiducial.core.geometry.rigid_fit import robust
 from thermal_fiducial.core.mapping.map_data import gauge, MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
 # Chi square of a view whose marker is behind the camera.
 _BEHIND_CHI2 = 1e8
@@ -191,6 +191,24 @@ class MapProblem:
         if not (np.all(np.isfinite(frames)) and np.all(np.isfinite(markers))):
             return None
         return self.evaluate(Poses(retract(now.state.T_map_camera, frames), retract(now.state.T_map_marker, markers)))
+
+    def mirrored(self, state: Poses) -> Poses:
+        """The state with each marker in about the other pose that its views allow: turned by 180 deg about them."""
+        sight = state.T_map_camera[self.frame, :3, 3] - state.T_map_marker[self.marker, :3, 3]
+        mean = self.over_markers(sight / np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), TINY))
+        mean /= np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), TINY)
+        about_sight = 2.0 * mean[:, :, None] * mean[:, None, :] - np.eye(3)
+        T_map_marker = state.T_map_marker.copy()
+        T_map_marker[:, :3, :3] = about_sight @ T_map_marker[:, :3, :3] @ np.diag([-1.0, -1.0, 1.0])
+        return Poses(state.T_map_camera, T_map_marker)
+
+    def markers_stepped(self, now: Linearised, scale: float) -> Poses:
+        """After one Gauss-Newton step of each marker alone."""
+        of_marker = now.weights(scale)[:, None, None] * np.swapaxes(now.J_marker, -1, -2)
+        information = self.over_markers(of_marker @ now.J_marker)
+        information += (TINY * np.max(information, axis=(1, 2), keepdims=True) + TINY) * np.eye(6)
+        steps = np.linalg.solve(information, self.over_markers(of_marker @ now.r[..., None]))
+        return Poses(now.state.T_map_camera, retract(now.state.T_map_marker, steps[..., 0]))
 
     @property
     def equations(self) -> NormalEquations:

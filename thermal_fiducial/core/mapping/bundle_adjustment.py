@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import noise_factor
-from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
+from thermal_fiducial.core.error_model import CHI2_OF_VIEW, noise_factor
+from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, robust, STIFFENED
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Snapshot
+from thermal_fiducial.core.mapping.candidates import UNAMBIGUOUS
 from thermal_fiducial.core.mapping.error_sources import ErrorSources
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
@@ -24,6 +25,8 @@ MAX_ITERATIONS = 25
 # Decrease of the cost, in units of chi square at the actual noise, that ends the iteration: a step of a third of the
 # standard deviation of one pose, for all poses together.
 _CONVERGED = 0.1
+# Gauss-Newton steps of a mirrored marker: its cost then differs by less than a thousandth.
+_MIRRORED_STEPS = 4
 # Median of chi square of eight degrees of freedom.
 _MEDIAN_CHI2 = 7.34
 # A marker is at two places if it has this many outlying views at least, and this share of all, and another pose
@@ -56,7 +59,9 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
     problem = MapProblem.build(snapshot)
     if problem is None:
         return None
-    return _result(problem, snapshot, _minimise(problem, problem.evaluate(problem.start)))
+    now = _minimise(problem, problem.evaluate(problem.start))
+    mirrored = _with_mirrored(problem, now)
+    return _result(problem, snapshot, now if mirrored is None else _minimise(problem, mirrored))
 
 
 def _minimise(problem: MapProblem, now: Linearised) -> Linearised:
@@ -74,6 +79,24 @@ def _minimise(problem: MapProblem, now: Linearised) -> Linearised:
         if gain <= _CONVERGED * scale:
             break
     return now
+
+
+def _with_mirrored(problem: MapProblem, now: Linearised) -> Linearised | None:
+    """The state with markers in their other pose where all their views together prefer it; None if none do.
+
+    A marker enters the map by a few views, whose errors may favour the wrong one of the planar ambiguity together.
+    """
+    scale, other = _scale(now.chi2), problem.mirrored(now.state)
+    for _ in range(_MIRRORED_STEPS):
+        other = problem.markers_stepped(problem.evaluate(other), scale)
+    mirrored = problem.evaluate(other)
+    costs = (problem.over_markers(robust(at.chi2, CHI2_OF_VIEW * scale)[0]) for at in (now, mirrored))
+    better = next(costs) - next(costs) > UNAMBIGUOUS * scale
+    better &= ~problem.held & ~problem.known.information.any(axis=(1, 2))
+    if not better.any():
+        return None
+    T_map_marker = np.where(better[:, None, None], other.T_map_marker, now.state.T_map_marker)
+    return problem.evaluate(replace(now.state, T_map_marker=T_map_marker))
 
 
 def _scale(chi2: FloatArray) -> float:

@@ -10,7 +10,7 @@ from support.wrong_lenses import drawn_lens
 
 from thermal_fiducial.core.error_model import covariance_of, draws_of, NO_SYSTEMATIC_ERRORS, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference, retract
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import rotation_angle, so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
 from thermal_fiducial.core.mapping.adjustment_problem import MapProblem
 from thermal_fiducial.core.mapping.keyframes import Keyframe, prior_poses, snapshot_of
@@ -60,6 +60,27 @@ def snapshot(rng, poses, sigma=0.02, count=30, disturbance=0.01, fixed=(0,)):
 
 def errors(refinement, poses):
     return np.stack([difference(marker.T_map_marker, poses[i]) for i, marker in refinement.markers.items()])
+
+
+def mirrored(T_map_marker, T_map_camera):
+    """About the other pose of a marker that a camera sees alike: turned half round the line of sight and its normal."""
+    sight = T_map_camera[:3, 3] - T_map_marker[:3, 3]
+    half_turn = so3_exp(np.pi * sight / np.linalg.norm(sight))
+    R = half_turn @ T_map_marker[:3, :3] @ so3_exp([0.0, 0.0, np.pi])
+    return transform(R, T_map_marker[:3, 3])
+
+
+def test_markers_that_entered_in_the_wrong_one_of_two_poses_are_turned_back():
+    poses = wall(np.random.default_rng(8), tilt=0.3)
+    recorded = snapshot(np.random.default_rng(9), poses, sigma=0.3, disturbance=0.001)
+    wrong = {key: replace(recorded.markers[key], T_map_marker=mirrored(poses[key], flight(0.0))) for key in (2, 5, 7)}
+    apart = [rotation_angle(wrong[key].T_map_marker[:3, :3].T @ poses[key][:3, :3]) for key in wrong]
+    assert min(apart) > np.deg2rad(20.0)
+    turned_back, right = refine(replace(recorded, markers=recorded.markers | wrong)), refine(recorded)
+    for key, marker in right.markers.items():
+        d = difference(turned_back.markers[key].T_map_marker, marker.T_map_marker)
+        # Both ends of the adjustment are within a third of a standard deviation of the minimum.
+        assert d @ np.linalg.solve(marker.covariance, d) < 0.5
 
 
 def test_noiseless_corners_give_the_exact_map():
