@@ -151,12 +151,12 @@ class Decoder:
             nothing = np.zeros(0)
             none = nothing.astype(np.int64)
             return Reading(none, none, nothing, nothing, nothing, none, none, nothing)
-        values, best, correlation, runner_up = self.likeness(image, quads, allowed, lag_tails)
+        match = self.likeness(image, quads, allowed, lag_tails)
         steps = np.zeros((len(quads), 4))
-        alike = np.flatnonzero(np.abs(correlation) >= _SIMILAR)
+        alike = np.flatnonzero(np.abs(match.correlation) >= _SIMILAR)
         if len(alike):
             steps[alike] = self._steps(image, quads[alike], None if lag_tails is None else lag_tails[alike])
-        return self._judged(values, best, correlation, runner_up, steps)
+        return self._judged(match, steps)
 
     def likeness(
         self,
@@ -195,21 +195,19 @@ class Decoder:
         """Cells (4 M, m, m) of all markers in all turns, 1 for black."""
         return 1.0 - self._grids.reshape(-1, self.cells, self.cells)
 
-    def _judged(
-        self, values: Float32Array, best: IntArray, correlation: FloatArray, runner_up: FloatArray, steps: FloatArray
-    ) -> Reading:
-        expected = self._grids.reshape(-1, self.cells**2)[best]
+    def _judged(self, match: PatternMatch, steps: FloatArray) -> Reading:
+        expected = self._grids.reshape(-1, self.cells**2)[match.best]
         shape = expected @ self._detrend
-        contrast = np.sum(values * shape, axis=1) / np.maximum(np.sum(shape * shape, axis=1), TINY)
+        contrast = np.sum(match.values * shape, axis=1) / np.maximum(np.sum(shape * shape, axis=1), TINY)
         safe = np.where(np.abs(contrast) < TINY, TINY, contrast)[:, None]
         # Cells on the scale from 0 for black to 1 for white.
-        read = expected + (values - contrast[:, None] * shape) / safe
+        read = expected + (match.values - contrast[:, None] * shape) / safe
         wrong = (read > 0.5) != (expected > 0.5)
         return Reading(
-            best // 4,
-            best % 4,
-            correlation,
-            runner_up,
+            match.best // 4,
+            match.best % 4,
+            match.correlation,
+            match.runner_up,
             contrast,
             np.sum(wrong & ~self._border, axis=1),
             np.sum(wrong & self._border, axis=1),
