@@ -26,7 +26,6 @@ from thermal_fiducial.core.detection.corners.sides import (
     EdgeModel,
     model,
     ONE_GAUSSIAN,
-    reaches,
     Sides,
     sides_of,
 )
@@ -78,7 +77,8 @@ def refine_corners(
     sides = sides_of(corners.x, camera, image.shape, behind.shape[2], columns, widest)
     blur = blur_of(sides, blur_px, motion.spread, parts)
     counts = counts_of(sides.pixel, image, motion.to_tails)
-    limits = reach.limits(sides, blur.width) if reach else reaches(sides, blur.width)
+    reach = reach or Reach.everywhere(len(corners.px))
+    limits = reach.limits(sides, blur.width)
     modelled, outward = model(sides, behind, blur, limits), sides.within_columns(limits[1])
     measured, displaced_px = _measured(counts, modelled, sides, blur, outward, motion_px)
     segments, shows = with_gradients(measured, sides, widest)
@@ -87,7 +87,7 @@ def refine_corners(
         return refined
     ending = ending_sides(counts, modelled, sides, measured, outward, blur.width, motion_px)
     shifts = refined.corners_px - corners.px
-    which, reach = _again(moving, shows, ending, shifts, reach or Reach.everywhere(len(moving)), outward, blur.width)
+    which, reach = _again(moving, shows, ending, shifts, reach, outward, blur.width)
     if len(which) == 0:
         return refined
     start = corners.only(which).at_pixels(refined.corners_px[which])
