@@ -60,8 +60,7 @@ class MarkerDetector:
             self._mount(config)
 
     def _mount(self, config: ArucoDetectorConfig) -> None:
-        T_body_camera = se3.camera_in_body(config)
-        self._history = FrameHistory(MotionTrack.of_rig(T_body_camera, config.bolometer_lag))
+        self._history = FrameHistory(MotionTrack(se3.camera_in_body(config), config.bolometer_lag))
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
         """Set the known markers: ID to (T_map_marker, side [m])."""

@@ -67,7 +67,7 @@ def test_the_noise_of_the_rates_averages_out_in_the_velocity_of_a_camera_with_a_
 def test_tracker_finds_the_twist_from_two_frames():
     rng = np.random.default_rng(1)
     points = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3))
-    tracker, ids, dt = MotionTrack.of_rig(np.eye(4)), np.arange(5), 1 / 30
+    tracker, ids, dt = MotionTrack(np.eye(4), 0.0), np.arange(5), 1 / 30
     later = moved(points, dt)
     x = [p[..., :2] / p[..., 2:] for p in (points, later)]
     tracker = tracker.after(10**9, None, ExpectedMarkers(ids, x[0], points[..., 2], np.full(5, 100.0)))
@@ -82,7 +82,7 @@ def turning(stamp_ns, states, jitter_ns=0, seed=6):
     """Twists of frames that turn ever faster, where their stamps jitter, and what they should be one lag ago."""
     points = np.random.default_rng(5).uniform([-0.6, -0.5, 2], [0.6, 0.5, 4], (5, 4, 3))
     rng, acceleration, covariance = np.random.default_rng(seed), np.array([0.0, 6.0, 2.0]), np.diag([1e-4] * 6)
-    tracker, ids = MotionTrack.of_rig(np.eye(4), LAG), np.arange(5)
+    tracker, ids = MotionTrack(np.eye(4), LAG), np.arange(5)
     for stamp in stamp_ns:
         at = stamp * 1e-9
         ages_ns = np.arange(-2, 7)[::-1] * 5_000_000 if states else []
@@ -137,7 +137,7 @@ def test_states_without_any_error_are_no_division_by_zero():
 def test_twist_of_a_late_frame_is_carried_back():
     points = np.random.default_rng(5).uniform([-0.6, -0.5, 2], [0.6, 0.5, 4], (5, 4, 3))
     seen = ExpectedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
-    tracker, now = MotionTrack.of_rig(np.eye(4)), 10**9
+    tracker, now = MotionTrack(np.eye(4), 0.0), 10**9
     tracker = tracker.after(now, Twist(TWIST, 1e-6 * np.eye(6), np.ones(6)), seen)
     ahead, back = (tracker.predict(now + dt_ns) for dt_ns in (30_000_000, -30_000_000))
     for twist in (ahead, back):
@@ -150,7 +150,7 @@ def test_markers_are_expected_where_the_motion_carries_them():
     rng = np.random.default_rng(4)
     points, dt = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3)), 1 / 30
     later, twist = moved(points, dt), Twist(TWIST, np.eye(6))
-    tracker = MotionTrack.of_rig(np.eye(4))
+    tracker = MotionTrack(np.eye(4), 0.0)
     tracker = tracker.after(
         0, twist, ExpectedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
     )
@@ -165,7 +165,7 @@ def test_a_late_frame_disturbs_nothing_and_a_clock_set_back_is_followed():
     rng = np.random.default_rng(4)
     points, twist = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3)), Twist(TWIST, np.eye(6))
     seen = ExpectedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
-    tracker, now = MotionTrack.of_rig(np.eye(4)), 10**9
+    tracker, now = MotionTrack(np.eye(4), 0.0), 10**9
     tracker = tracker.after(now, twist, seen)
     ahead = tracker.expected(now + 33_000_000, twist)
     # Whose own markers are expected where they were then.
@@ -180,7 +180,7 @@ def test_a_late_frame_disturbs_nothing_and_a_clock_set_back_is_followed():
 
 def test_motion_that_shows_no_markers_is_forgotten():
     """A wrong one would blur them away in frame after frame; the filter's states are heard all the same."""
-    tracker, period_ns = MotionTrack.of_rig(np.eye(4)), 33_333_333
+    tracker, period_ns = MotionTrack(np.eye(4), 0.0), 33_333_333
     tracker = tracker.after(
         0,
         Twist(np.full(6, 9.0), np.eye(6)),

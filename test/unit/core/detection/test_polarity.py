@@ -12,7 +12,7 @@ BOTH = 1.0, -1.0
 
 def seen(*frames):
     """The history after frames with markers of such contrast-to-noise ratios."""
-    history = FrameHistory(MotionTrack.of_rig(np.eye(4)))
+    history = FrameHistory(MotionTrack(np.eye(4), 0.0))
     for index, cnr in enumerate(frames):
         count = len(cnr)
         markers = ExpectedMarkers(np.arange(count), np.zeros((count, 4, 2)), np.ones((count, 4)), np.array(cnr))

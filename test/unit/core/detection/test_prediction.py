@@ -30,7 +30,7 @@ def states(offset_s=0.0):
 
 
 def predicted(prior, time_offset_std=0.03):
-    return predict_frame(STAMP_NS, prior, MotionTrack.of_rig(np.eye(4), 0.010), 0.2, time_offset_std)
+    return predict_frame(STAMP_NS, prior, MotionTrack(np.eye(4), 0.010), 0.2, time_offset_std)
 
 
 @pytest.mark.parametrize('offset_s', [0.0, -0.060, 0.035])

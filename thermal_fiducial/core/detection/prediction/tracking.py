@@ -46,24 +46,18 @@ class MotionTrack:
 
     Parameters
     ----------
-    T_body_camera, from_body : (4, 4), (6, 6) pose of the camera on the body, map from the body's twist to the camera's
+    T_body_camera : (4, 4)
     lag : time constant of the bolometers [s]
     stamp_ns, twist, markers : of the last frame; the acceleration is what the last two frames show
     last_seen_ns : stamp of the last frame that showed markers
     """
 
     T_body_camera: FloatArray
-    from_body: FloatArray
     lag: float
     stamp_ns: int | None = None
     twist: Twist | None = None
     markers: ExpectedMarkers = field(default_factory=ExpectedMarkers.none)
     last_seen_ns: int | None = None
-
-    @staticmethod
-    def of_rig(T_body_camera: FloatArray, lag: float = 0.0) -> 'MotionTrack':
-        """The track before the first frame of a camera at ``T_body_camera`` (4, 4)."""
-        return MotionTrack(T_body_camera, twist_transfer(T_body_camera), lag)
 
     def predict(self, stamp_ns: int) -> Twist | None:
         """Twist predicted for a frame by those before it; None without any information."""
@@ -141,7 +135,7 @@ class MotionTrack:
             acceleration = share * (twist.value - self.twist.value) / dt
         if twist is not None:
             twist = replace(twist, acceleration=acceleration)
-        return MotionTrack(self.T_body_camera, self.from_body, self.lag, stamp_ns, twist, markers, last_seen_ns)
+        return MotionTrack(self.T_body_camera, self.lag, stamp_ns, twist, markers, last_seen_ns)
 
     def _since(self, stamp_ns: int) -> float | None:
         """Time since the last frame [s], negative for a late frame; None if it is too long for the motion to hold."""
@@ -183,7 +177,8 @@ def predict_frame(
     if not states and (other := prior.nearest(odometry_ns)) is not None:
         states = [other]
     if states and abs(odometry_ns - states[-1].stamp_ns) < _STALE_NS:
-        twist: Twist | None = twist_by_odometry(odometry_ns, states, track.from_body, track.lag, clock_std_s)
+        from_body = twist_transfer(track.T_body_camera)
+        twist: Twist | None = twist_by_odometry(odometry_ns, states, from_body, track.lag, clock_std_s)
     else:
         twist = track.predict(stamp_ns)
     nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
