@@ -60,14 +60,6 @@ class Candidate:
         if len(self.views) > MAX_VIEWS:
             self._drop_most_redundant()
 
-    def move(self, displacement: Displacement) -> None:
-        """Apply a displacement of the map to the views' camera poses."""
-        self.views = [view.moved(displacement.at(view.stamp_ns)) for view in self.views]
-
-    def calibrate(self, before: Camera, now: Camera) -> None:
-        """Keep the directions of all views where the calibration of the camera changes."""
-        self.views = [view.in_pixels_of(before, now) for view in self.views]
-
     def place(self, camera: Camera, errors: SystematicErrors) -> MapMarker | str:
         """The marker in the map if the views determine it uniquely, else what it waits for, in words."""
         self.untried = 0
@@ -137,8 +129,9 @@ class NewMarkers:
         Markers to enter the map, now determined by their views, and what the others wait for, in words by ID.
         """
         if self._camera is not None and not camera.matches(self._camera):
+            # The directions of all views stay.
             for candidate in self.candidates.values():
-                candidate.calibrate(self._camera, camera)
+                candidate.views = [view.in_pixels_of(self._camera, camera) for view in candidate.views]
         self._camera = camera
         shown = []
         posed = np.isfinite(seen.branches[:, 0]).all(axis=(1, 2))
@@ -164,4 +157,4 @@ class NewMarkers:
     def move(self, displacement: Displacement) -> None:
         """Apply a displacement of the map to all candidates."""
         for candidate in self.candidates.values():
-            candidate.move(displacement)
+            candidate.views = [view.moved(displacement.at(view.stamp_ns)) for view in candidate.views]

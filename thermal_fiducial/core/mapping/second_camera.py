@@ -44,15 +44,6 @@ class SecondClock:
         self.variance = self._prior = std**2
         self._stamp_ns: int | None = None
 
-    def covariance(self, velocity: FloatArray) -> FloatArray:
-        """Covariance (6, 6) of a pose of the second camera in the first one's clock.
-
-        Parameters
-        ----------
-        velocity : (6,) of the camera in the map [m/s, rad/s]
-        """
-        return of_single_error(velocity, np.sqrt(self.variance))
-
     def add(self, stamp_ns: int, apart: FloatArray, velocity: FloatArray, covariance: FloatArray) -> None:
         """Update with both cameras' poses of one instant.
 
@@ -153,7 +144,8 @@ class SecondCamera:
         if moved is None:
             return None
         velocity = np.zeros(6) if middle is None else middle.velocity
-        return replace(moved, covariance=moved.covariance + self.clock.covariance(velocity)), moved, velocity
+        of_clock = of_single_error(velocity, np.sqrt(self.clock.variance))
+        return replace(moved, covariance=moved.covariance + of_clock), moved, velocity
 
 
 def seen_from(pose: CameraPose, T_camera_other: FloatArray) -> CameraPose:
