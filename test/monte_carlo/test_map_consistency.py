@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.walls import CAMERA, flight, see, SIZE, wall
+from support.walls import CAMERA, flight, NO_SYSTEMATIC_ERRORS, see, SIZE, wall
 
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
@@ -28,7 +28,7 @@ def one_map(seed):
         i: MapMarker(i, SIZE, i == 0, T if i == 0 else retract(T, 0.01 * rng.normal(size=6)), (i > 0) * np.eye(6))
         for i, T in poses.items()
     }
-    refinement = refine(snapshot_of(markers, frames, {}))
+    refinement = refine(snapshot_of(markers, frames, {}, 0, NO_SYSTEMATIC_ERRORS))
     nees = []
     for i in range(1, 8):
         d = difference(poses[i], refinement.markers[i].T_map_marker)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.walls import CAMERA, flight, see, SIZE, stamp, wall
+from support.walls import CAMERA, flight, NO_SYSTEMATIC_ERRORS, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import (
@@ -13,7 +13,6 @@ from thermal_fiducial.core.error_model import (
     covariance_of,
     drawn_sum,
     DRAWS,
-    NO_SYSTEMATIC_ERRORS,
     scale_of_map,
     SystematicErrors,
 )

@@ -1,12 +1,12 @@
 """The bundle adjustment as arrays: its input, and residuals, Jacobians and normal equations of all views."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from thermal_fiducial.config import CHI2_OF_POSE
-from thermal_fiducial.core.error_model import CHI2_OF_VIEW, NO_SYSTEMATIC_ERRORS, SystematicErrors
+from thermal_fiducial.core.error_model import CHI2_OF_VIEW, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
 from thermal_fiducial.core.geometry.rigid_fit import robust
@@ -55,10 +55,10 @@ class Snapshot:
     corners: FloatArray
     covariances: FloatArray
     #: prior pose and covariance (6, 6) by ID, of markers of an earlier map
-    known: Mapping[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    map_revision: int = 0
+    known: Mapping[int, tuple[FloatArray, FloatArray]]
+    map_revision: int
     #: systematic errors that enter the covariances
-    errors: SystematicErrors = NO_SYSTEMATIC_ERRORS
+    errors: SystematicErrors
 
     def useful(self) -> BoolArray:
         """Which views (n,) constrain the map and are connected with a held or prior marker, or with odometry.

@@ -9,7 +9,6 @@ import numpy as np
 from thermal_fiducial.core.error_model import (
     divided_prior,
     draws_of,
-    NO_SYSTEMATIC_ERRORS,
     of_correlated_odometry,
     SystematicErrors,
 )
@@ -58,8 +57,8 @@ def snapshot_of(
     markers: Mapping[int, MapMarker],
     frames: Sequence[Keyframe],
     known: Mapping[int, tuple[FloatArray, FloatArray]],
-    map_revision: int = 0,
-    errors: SystematicErrors = NO_SYSTEMATIC_ERRORS,
+    map_revision: int,
+    errors: SystematicErrors,
 ) -> Snapshot:
     """At least one keyframe, and ``markers`` of the map to adjust, as a refinement works on them."""
     cameras = {id(frame.camera): frame.camera for frame in frames}

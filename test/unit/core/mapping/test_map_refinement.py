@@ -5,10 +5,10 @@ import pickle
 
 import numpy as np
 import pytest
-from support.walls import CAMERA, flight, see, SIZE, wall
+from support.walls import CAMERA, flight, NO_SYSTEMATIC_ERRORS, see, SIZE, wall
 from support.wrong_lenses import drawn_lens
 
-from thermal_fiducial.core.error_model import covariance_of, draws_of, NO_SYSTEMATIC_ERRORS, SystematicErrors
+from thermal_fiducial.core.error_model import covariance_of, draws_of, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import rotation_angle, so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
