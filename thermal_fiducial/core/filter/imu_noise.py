@@ -6,7 +6,7 @@ import numpy as np
 
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.filter.imu_input import GAP_NS
-from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.core.types import FloatArray, SECOND_NS, TINY
 
 #: Time constant [s] of the mean force; motion is what differs from it.
 _SLOW = 0.2
@@ -18,7 +18,7 @@ _LAGS = _SHORTEST_LAG * 2.0**_OCTAVES
 #: least motion that is assumed.
 _SMOOTHEST = np.repeat((1.5, 2.0), 2)
 #: Added before logarithms are taken [(rad/s)^2, (m/s^2)^2].
-_TINY = 1e-12
+_NO_MOTION = 1e-12
 #: Least structure function that is assumed: an IMU at rest may begin to move in a gap.
 _LEAST_MOTION = (2.0 * (_LAGS / 0.2) ** 3 / (1.0 + (_LAGS / 0.2) ** 2))[:, None] * np.array((0.1, 0.3)) ** 2
 #: Correlation time [s] of errors by nonlinearity, bandwidth and internal lever arms: that of the motion.
@@ -134,7 +134,7 @@ class StructureFunction:
         place = math.log2(seconds / _SHORTEST_LAG)
         lower = min(max(int(place), 0), len(_LAGS) - 2)
         into = min(max(place - lower, 0.0), 1.0)
-        log_D = np.log2(np.hstack((self._measured, _LEAST_MOTION))[lower : lower + 3] + _TINY)
+        log_D = np.log2(np.hstack((self._measured, _LEAST_MOTION))[lower : lower + 3] + _NO_MOTION)
         slopes = np.clip(log_D[1:] - log_D[:-1], 0.0, _SMOOTHEST)
         at_step = 2.0 ** (log_D[1] + slopes[0] * (place - lower - 1))
         # From one step to two of them.
@@ -186,7 +186,7 @@ class NoiseFloor:
         self._window = np.hanning(count + 1)[:-1, None]
         # Power of second differences to squared density of the samples.
         gain = 4.0 * np.sin(np.pi * frequencies * seconds) ** 2
-        scale = seconds / (np.maximum(gain, 1e-9) ** 2 * (self._window**2).sum())
+        scale = seconds / (np.maximum(gain, TINY) ** 2 * (self._window**2).sum())
         self._bands = inside / inside.sum(axis=1, keepdims=True) * scale
 
     def _measure(self) -> None:

@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 
+from thermal_fiducial.core.geometry.plausibility import LEAST_INDEPENDENT
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.types import FloatArray
 
@@ -28,8 +29,6 @@ LIMITS = np.array(((WHITE, 1e-8, 1e-10), (30.0 * WHITE, 4e-4, 1e-4)))
 _MEMORY = np.array((10.0, 300.0, 300.0))
 #: Weight of the initial values, as information about their logarithms; limit of the normalised squared innovation.
 _PRIOR, _LARGEST_SQUARE = 5.0, 9.0
-#: Least share of the variance of a component that the others leave unexplained.
-_LEAST_INDEPENDENT = 1e-12
 #: Least covariance of a pose: rounding of float32 corners [rad, m].
 _ROUNDING = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
 
@@ -117,7 +116,7 @@ def share_that_stays(earlier: FloatArray, claimed: FloatArray) -> FloatArray:
     stds = np.sqrt(claimed.diagonal())
     # Rounding may make correlations indefinite, where an unknown rotation is carried over a lever arm.
     values, vectors = np.linalg.eigh(claimed / np.outer(stds, stds))
-    roots = np.sqrt(np.maximum(values, _LEAST_INDEPENDENT))
+    roots = np.sqrt(np.maximum(values, LEAST_INDEPENDENT))
     from_units, to_units = stds[:, None] * vectors * roots, (vectors / roots).T / stds
     # In units of the claim, along the axes in which both are diagonal.
     variances, axes = np.linalg.eigh(to_units @ earlier @ to_units.T)

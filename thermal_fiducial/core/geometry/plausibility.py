@@ -18,7 +18,7 @@ LARGEST_COORDINATE = 1e5
 #: Variances [m^2, rad^2, px^2]: from a tenth of a nanometre to ten kilometres, which others write for "unknown".
 SMALLEST_VARIANCE, LARGEST_VARIANCE = 1e-20, 1e8
 #: Least share of a variance that the other components may leave unexplained; rounding takes less than a tenth of it.
-_LEAST_INDEPENDENT = 1e-12
+LEAST_INDEPENDENT = 1e-12
 #: Relative difference of entries that should be equal, by rounding of a few operations.
 _ROUNDING = 1e-9
 #: Added to variances that may be zero, before the check, beside that share of the largest one [m^2, rad^2].
@@ -56,7 +56,7 @@ def checked_covariance(values: FloatArray, what: str, *, partial: bool = False) 
         raise InputError(f'{what} that is not positive definite')
     try:
         # A reduced diagonal tests the least own variance of each component, whatever their units.
-        np.linalg.cholesky(P - _LEAST_INDEPENDENT * eye * P)
+        np.linalg.cholesky(P - LEAST_INDEPENDENT * eye * P)
     except np.linalg.LinAlgError:
         raise InputError(f'{what} that is not positive definite') from None
     return values if (np.abs(symmetric - values) <= _ROUNDING * np.abs(values)).all() else symmetric

@@ -26,19 +26,19 @@ _NEIGHBOURS = np.array([(row, column) for row in (-1, 0, 1) for column in (-1, 0
 class BadPixelFinder:
     """Finds pixels that do not follow the scene, from one frame in ``interval``.
 
-    A frame votes for a pixel that exceeds (or falls below) its neighbours by ``sigmas`` times the noise and by
+    A frame votes for a pixel that exceeds (or falls below) its neighbours by ``SIGMAS`` times the noise and by
     a multiple of the neighbours' own spread; votes fade in the frames where it doesn't. A stuck pixel stands out as
     soon as the scene around it has changed.
     """
 
     VOTE = 4
     ENOUGH = 12
+    SIGMAS = 8.0
 
-    def __init__(self, shape: tuple[int, int], interval: int = 10, sigmas: float = 8.0) -> None:
+    def __init__(self, shape: tuple[int, int], interval: int = 10) -> None:
         self._votes = np.zeros(shape, np.uint8)
         self._bad = np.zeros(shape, np.bool_)
         self._interval = interval
-        self._sigmas = sigmas
         self._frames = 0
 
     def add(self, counts: Counts) -> IntArray | None:
@@ -49,7 +49,7 @@ class BadPixelFinder:
             return None
         noise = pixel_noise(counts)
         surroundings = np.asarray(cv2.medianBlur(counts, 3), np.uint16)
-        outlying = _stands_out(counts, surroundings, self._sigmas * noise)
+        outlying = _stands_out(counts, surroundings, self.SIGMAS * noise)
         self._votes -= self._votes > 0
         votes = self._votes.reshape(-1)
         votes[outlying] = np.minimum(votes[outlying] + self.VOTE + 1, 4 * self.ENOUGH)

@@ -26,15 +26,13 @@ from thermal_fiducial.core.mapping.located import (
     Sight,
     squared_distance,
 )
-from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.mapping.map_data import MapMarker, MEMORY
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray, SECOND_NS
 
 #: Reason of quarantine of markers that the map file already had there.
 FROM_FILE = 'in quarantine since before the map was loaded'
-#: Weight of a new frame in the share of inconsistent frames: a memory of 20 frames.
-MEMORY = 0.05
 #: Share of inconsistent frames above which a marker is put in quarantine, and below which it is released.
 QUARANTINE, RELEASE = 0.7, 0.1
 #: Ratio of an error to its standard deviation above which a frame counts as inconsistent.

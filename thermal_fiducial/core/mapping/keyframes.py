@@ -22,8 +22,7 @@ from thermal_fiducial.core.motion_prior import displacement_covariance, Predicte
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
 # Side of a cell of camera positions [m] and of viewing directions [components of a unit vector] to begin with.
-_CELL_M = 0.25
-_CELL_DIRECTION = 0.25
+_CELL = 0.25
 # Share of the budget to which the store is thinned, so that it is thinned seldom.
 _THINNED = 0.85
 # A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
@@ -256,7 +255,7 @@ class KeyframeStore:
         A cell has its middle, not a corner, in the origin of the map, so that coarse enough ones hold all keyframes.
         """
         T = np.stack([frame.T_map_camera for frame in self.frames.values()])
-        scaled = np.concatenate([T[:, :3, 3] / _CELL_M, T[:, :3, 2] / _CELL_DIRECTION], axis=-1) / coarseness
+        scaled = np.concatenate([T[:, :3, 3], T[:, :3, 2]], axis=-1) / (_CELL * coarseness)
         cells: dict[tuple[int, ...], list[int]] = defaultdict(list)
         for stamp, key in zip(self.frames, np.rint(scaled).astype(int).tolist(), strict=True):
             cells[tuple(key)].append(stamp)
