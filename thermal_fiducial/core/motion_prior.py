@@ -109,6 +109,11 @@ class PredictedCamera:
     #: (6,) of the camera in the map [m/s, rad/s]
     velocity: FloatArray
 
+    def of_velocity(self, seconds: float) -> FloatArray:
+        """Covariance (6, 6) of the displacement in ``seconds`` by a constant error of the velocity."""
+        R = self.odometry.T_map_body[:3, :3]
+        return seconds**2 * turned(self.odometry.twist_covariance, R)
+
 
 def predicted_camera(
     prior: MotionPrior | None, camera_stamp_ns: int, T_body_camera: FloatArray, time_offset_std: float
@@ -150,7 +155,6 @@ def displacement_covariance(first: CameraPose, predicted: PredictedCamera) -> Fl
     One is the difference of the covariances, as if the error grew by independent increments; the other the error of
     the velocity, constant over that time.
     """
-    seconds, now = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS, predicted.odometry
-    of_speed = seconds**2 * turned(now.twist_covariance, now.T_map_body[:3, :3])
-    bounds = positive(predicted.pose.covariance - first.covariance), of_speed
+    seconds = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS
+    bounds = positive(predicted.pose.covariance - first.covariance), predicted.of_velocity(seconds)
     return min(bounds, key=lambda covariance: float(np.trace(covariance)))

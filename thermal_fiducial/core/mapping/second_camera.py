@@ -13,8 +13,9 @@ import numpy as np
 from thermal_fiducial.config import CHI2_OF_POSE
 from thermal_fiducial.core.error_model import of_correlated_odometry, of_single_error
 from thermal_fiducial.core.frame_period import FramePeriod
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract, turned
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.mapping.located import squared_distance
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
@@ -166,9 +167,9 @@ def intersection(first: CameraPose, second: CameraPose) -> CameraPose | None:
     Half of each bounds the covariance for any correlation of their errors (S. Julier, J. Uhlmann, "A non-divergent
     estimation algorithm in the presence of unknown correlations", 1997), that of the map's errors in them, too.
     """
-    apart = difference(second.T_map_camera, first.T_map_camera)
-    if apart @ np.linalg.solve(first.covariance + second.covariance, apart) > CHI2_OF_POSE:
+    if squared_distance(first, second) > CHI2_OF_POSE:
         return None
+    apart = difference(second.T_map_camera, first.T_map_camera)
     informations = [0.5 * np.linalg.inv(pose.covariance) for pose in (first, second)]
     covariance = np.linalg.inv(informations[0] + informations[1])
     gains = [covariance @ information for information in informations]
@@ -190,7 +191,7 @@ def moved_by_odometry(pose: CameraPose, stamp_ns: int, middle: PredictedCamera |
         return pose
     if middle is None:
         return None
-    seconds, state = (stamp_ns - pose.stamp_ns) / SECOND_NS, middle.odometry
+    seconds = (stamp_ns - pose.stamp_ns) / SECOND_NS
     there = retract(pose.T_map_camera, seconds * middle.velocity)
-    of_velocity = seconds**2 * turned(state.twist_covariance, state.T_map_body[:3, :3])
-    return replace(pose, stamp_ns=stamp_ns, T_map_camera=there, covariance=pose.covariance + of_velocity)
+    covariance = pose.covariance + middle.of_velocity(seconds)
+    return replace(pose, stamp_ns=stamp_ns, T_map_camera=there, covariance=covariance)
