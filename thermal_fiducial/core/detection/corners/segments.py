@@ -71,11 +71,7 @@ class Segments(NamedTuple):
     typical: FloatArray
 
     def displaced_by_slopes(self) -> FloatArray:
-        """Displacement (N,) of a side by a slope of its contrast across it as large as that along it, rms [px]."""
-        return OF_UNEVEN_CONTRAST_PX * self._slope_of_contrast() / np.maximum(np.abs(self.typical[:, 0]), TINY)
-
-    def _slope_of_contrast(self) -> FloatArray:
-        """Slope (N,) of the contrast along the sides, rms, as a change from segment to segment.
+        """Displacement (N,) of a side by a slope of its contrast across it as large as that along it, rms [px].
 
         Over two segments a slope changes it twice as much as over one, noise and the cells behind the sides as much. A
         few segments that other objects cover do not count.
@@ -87,7 +83,8 @@ class Segments(NamedTuple):
             both = (used[..., apart:] & used[..., :-apart]).reshape(change.shape)
             sizes.append(median_of(change, both)[:, 0])
         squared = np.maximum(sizes[1] * sizes[1] - sizes[0] * sizes[0], 0.0)
-        return np.asarray(SIGMA_OF_MEDIAN / math.sqrt(3.0) * np.sqrt(squared))
+        slope = SIGMA_OF_MEDIAN / math.sqrt(3.0) * np.sqrt(squared)
+        return np.asarray(OF_UNEVEN_CONTRAST_PX * slope / np.maximum(np.abs(self.typical[:, 0]), TINY))
 
 
 class RobustFit(NamedTuple):
