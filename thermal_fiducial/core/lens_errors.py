@@ -21,12 +21,7 @@ _LEAST_INDEPENDENT = 1e-6
 
 
 class LensErrors:
-    """Errors of the lens model at n corners (..., 2) [px].
-
-    Parameters
-    ----------
-    errors : standard deviation and length of the process
-    """
+    """Errors of the lens model at n corners (..., 2) [px]; ``errors`` gives size and length of the process."""
 
     def __init__(self, corners: FloatArray, camera: Camera, errors: SystematicErrors) -> None:
         length = errors.corner_length * camera.width

@@ -28,16 +28,7 @@ _NEXT, _OPPOSITE = np.array([1, 2, 3, 0]), np.array([2, 3, 0, 1])
 
 
 def skew(v: npt.ArrayLike) -> FloatArray:
-    """Cross-product matrix.
-
-    Parameters
-    ----------
-    v : (..., 3) vectors
-
-    Returns
-    -------
-    (..., 3, 3) with ``skew(v) @ w == cross(v, w)``
-    """
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3): ``skew(v) @ w == cross(v, w)``."""
     v = np.asarray(v, dtype=np.float64)
     return np.asarray((v @ SKEW).reshape(*v.shape, 3))
 

@@ -106,12 +106,7 @@ class Candidate:
 
 
 class NewMarkers:
-    """All candidates.
-
-    Parameters
-    ----------
-    size, sizes : side of a marker [m], and by ID of those that differ
-    """
+    """All candidates; ``size`` is the side of a marker [m], ``sizes`` that of those that differ, by ID."""
 
     def __init__(self, size: float, sizes: Mapping[int, float]) -> None:
         self._size, self._sizes = size, sizes

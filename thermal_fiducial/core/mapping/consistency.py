@@ -101,13 +101,10 @@ class Consistency:
     some seconds without another marker odometry has drifted so far that it contradicts nothing. So what the first view
     showed is remembered, until the marker is back in its place, is seen with another one, or a second marker
     contradicts odometry too: then it is odometry that is wrong.
-
-    Parameters
-    ----------
-    markers : of the map
     """
 
     def __init__(self, markers: Mapping[int, MapMarker]) -> None:
+        """``markers``: of the map."""
         #: markers in quarantine, each with the reason in words
         self.quarantined = {key: FROM_FILE for key, marker in markers.items() if not marker.trusted}
         # Shares of inconsistent frames by ID: markers that the file has in quarantine stay until frames release them.

@@ -235,12 +235,7 @@ class MarkerMapper:
         return self._keyframes.snapshot(self.map, self._errors, views)
 
     def refine(self, views: int = sys.maxsize) -> AdjustedMap | None:
-        """Run a bundle adjustment here and apply it: of all keyframes, or as in flight.
-
-        Parameters
-        ----------
-        views : of :meth:`snapshot`
-        """
+        """Run a bundle adjustment here, of so many ``views`` as :meth:`snapshot` takes, and apply it."""
         snapshot = self.snapshot(views)
         refinement = refine(snapshot) if snapshot is not None else None
         if refinement is not None:

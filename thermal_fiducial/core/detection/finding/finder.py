@@ -73,12 +73,7 @@ class FrameHistory:
 
 
 class MarkerFinder:
-    """Finds the markers of a dictionary.
-
-    Parameters
-    ----------
-    decoder : of the dictionary
-    """
+    """Finds the markers of the dictionary of a ``decoder``."""
 
     def __init__(self, decoder: Decoder) -> None:
         self._decoder = decoder

@@ -61,12 +61,7 @@ class Outlines(NamedTuple):
 
 
 class BlindSearch:
-    """Finds the markers of a dictionary anywhere in a frame.
-
-    Parameters
-    ----------
-    decoder : of the dictionary
-    """
+    """Finds the markers of the dictionary of a ``decoder`` anywhere in a frame."""
 
     def __init__(self, decoder: Decoder) -> None:
         self._decoder = decoder

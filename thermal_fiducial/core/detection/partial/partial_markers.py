@@ -71,12 +71,7 @@ class _PartialMarker:
 
 
 class PartialMarkerSearch:
-    """Finds known markers that are partially in view.
-
-    Parameters
-    ----------
-    decoder, bits : of the dictionary, (M, n, n)
-    """
+    """Finds known markers that are partially in view; ``bits`` (M, n, n) are those of the decoder's dictionary."""
 
     def __init__(self, decoder: Decoder, bits: Gray) -> None:
         self._bits, self._cells = bits, decoder.cells

@@ -17,12 +17,7 @@ _FEWEST, _LEAST_PATTERN = 12, 2.0
 
 
 class VisibleCells:
-    """Patterns of a dictionary with their white surroundings, for correlation of any subset of their cells.
-
-    Parameters
-    ----------
-    decoder : of the dictionary
-    """
+    """Patterns of a dictionary with their white surroundings, for correlation of any subset of their cells."""
 
     def __init__(self, decoder: Decoder) -> None:
         grids = decoder.patterns(np.arange(decoder.count), np.zeros(decoder.count, dtype=np.int64))
