@@ -55,8 +55,6 @@ class SystematicErrors:
 
 #: 99.9 % quantile of chi square with eight degrees of freedom, of a view of a marker.
 CHI2_OF_VIEW = 26.1
-#: Focal lengths of square pixels differ by less than this share; others are of pixels that are not square.
-SQUARE_PIXELS = 0.01
 #: Errors of successive odometry poses are correlated for seconds: this many count as one.
 CORRELATED_ODOMETRY = 30.0
 #: Part of the re-projection error, by bent plates and corner bias, that is no sign of an inconsistent marker [px].

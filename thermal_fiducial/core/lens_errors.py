@@ -10,7 +10,7 @@ from zlib import crc32
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import DRAWS, SQUARE_PIXELS, SystematicErrors
+from thermal_fiducial.core.error_model import DRAWS, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 
@@ -32,7 +32,7 @@ class LensErrors:
         self.modes: FloatArray = (columns[..., :, None] * rows[..., None, :]).reshape(*corners.shape[:-1], -1)
         self._px, self._camera = errors.corner_px, camera
         #: (..., 2) by one standard deviation of the aspect ratio [px]
-        self._of_aspect: FloatArray = errors.aspect * _aspect(camera) * (corners - camera.principal_point)
+        self._of_aspect: FloatArray = errors.aspect * camera.aspect_error * (corners - camera.principal_point)
 
     def covariance(self, gains: FloatArray) -> FloatArray:
         """Covariance (m, m) of what has derivatives ``gains`` (n, m, 2) [1/px] by the corners."""
@@ -45,13 +45,6 @@ class LensErrors:
         lens, aspect = _variables(crc32(np.ascontiguousarray(self._camera.K).tobytes()), self.modes.shape[-1])
         smooth = np.tensordot(self.modes, self._px * lens[..., chosen], axes=1)
         return np.asarray(smooth + self._of_aspect[..., None] * aspect[chosen])
-
-
-def _aspect(camera: Camera) -> FloatArray:
-    """Standard deviations (2,) of the focal lengths [share]: half of their difference, with opposite signs."""
-    along, across = camera.K[0, 0], camera.K[1, 1]
-    share = abs(along - across) / (along + across)
-    return np.asarray(share * np.array([1.0, -1.0]) * (2.0 * share < SQUARE_PIXELS))
 
 
 def _modes(places: FloatArray, size: int, length: float) -> FloatArray:

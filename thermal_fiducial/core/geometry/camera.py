@@ -37,6 +37,8 @@ _NO_COEFFICIENT = 1e-15
 # Coefficients of the derivative of angle + k1 angle^3 + k2 angle^5 ... with respect to the angle.
 _RISE = np.arange(1, 10, 2)
 _EYE, _STILL = np.eye(3), np.zeros(3)
+# Focal lengths of square pixels differ by less than this share.
+_SQUARE_PIXELS = 0.01
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,13 @@ class Camera:
     def focal_px(self) -> float:
         """Geometric mean of the two focal lengths [px]."""
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+    @cached_property
+    def aspect_error(self) -> FloatArray:
+        """Half of what the focal lengths differ by, as shares (2,) of them: an error, as pixels are square."""
+        along, across = self.K[0, 0], self.K[1, 1]
+        share = (along - across) / (along + across)
+        return np.asarray(share * np.array([1.0, -1.0]) * (2.0 * abs(share) < _SQUARE_PIXELS))
 
     @property
     def principal_point(self) -> FloatArray:

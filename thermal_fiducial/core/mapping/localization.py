@@ -40,9 +40,8 @@ WIDE = np.deg2rad(25.0)
 _HEAVY = 0.3
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.
 _PROPOSERS = 4
-# Most Gauss-Newton steps of a pose after the first, and the square of a step that is small enough, in standard
-# deviations of the pose.
-_MORE_STEPS, _SMALL_STEP = 4, 0.01
+# Most Gauss-Newton steps of a pose, and the square of the last one, in its standard deviations by the corners' noise.
+_MOST_STEPS, _SMALL_STEP = 5, 0.01
 # Standard deviation of a rotation beyond which nothing is known of it, and its linearisation means nothing [rad].
 _NOTHING_KNOWN = 1.0
 
@@ -151,28 +150,25 @@ class _JointFit:
     def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
         """Gauss-Newton steps from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
 
-        None if the markers do not determine the pose.
+        The linearisation of the last step, in corners, map and scale, gives the covariances. None if the markers do not
+        determine the pose.
         """
-        found = self._step(T_map_camera, seen, weights)
-        for _ in range(_MORE_STEPS):
-            if found is None:
+        n = len(weights)
+        for remaining in reversed(range(_MOST_STEPS)):
+            J = seen.J_camera.reshape(-1, 6)
+            weighted, chi2 = self._weighted(seen, weights)
+            information = J.T @ weighted
+            try:
+                gains = np.linalg.inv(information) @ weighted.T
+            except np.linalg.LinAlgError:
                 return None
-            T, step = found.pose.T_map_camera, difference(found.pose.T_map_camera, T_map_camera)
-            if step @ np.linalg.solve(found.pose.covariance, step) < _SMALL_STEP:
-                return found
-            T_map_camera, seen = T, self.sight.reprojected(self.camera, T)
-            found = self._step(T, seen, weights) if np.all(np.isfinite(seen.residuals)) else None
-        return found
-
-    def _step(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
-        """One Gauss-Newton step; the same linearisation, in corners, map and scale, gives the covariances."""
-        n, J = len(weights), seen.J_camera.reshape(-1, 6)
-        weighted, chi2 = self._weighted(seen, weights)
-        try:
-            gains = np.linalg.inv(J.T @ weighted) @ weighted.T
-        except np.linalg.LinAlgError:
-            return None
-        step = gains @ seen.residuals.ravel()
+            step = gains @ seen.residuals.ravel()
+            if remaining == 0 or step @ information @ step < _SMALL_STEP:
+                break
+            T_map_camera = retract(T_map_camera, step)
+            seen = self.sight.reprojected(self.camera, T_map_camera)
+            if not np.all(np.isfinite(seen.residuals)):
+                return None
         after = replace(seen, residuals=seen.residuals - (J @ step).reshape(n, 4, 2))
         return self._location(T_map_camera, step, gains, chi2, after, weights)
 
