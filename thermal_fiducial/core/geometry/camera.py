@@ -32,6 +32,9 @@ _WIDEST = math.radians(85.0)
 # The same as a share of the normalised radius at which a lens folds back: from there on the image of a step outwards is
 # less than a fifth as long as in the middle.
 _BEFORE_FOLD = 0.9
+# Least length of a step of the angle in the image, as a share of its length in the middle, also of lenses that nearly
+# fold; number of angles that are looked at.
+_LEAST_STEP, _ANGLES = 0.2, 171
 # A last coefficient below this has no root at any angle that a lens can have, but makes the others' overflow.
 _NO_COEFFICIENT = 1e-15
 # Coefficients of the derivative of angle + k1 angle^3 + k2 angle^5 ... with respect to the angle.
@@ -202,11 +205,23 @@ class Camera:
     @cached_property
     def _shown_px(self) -> float:
         """Radius [px] around the principal point that the lens shows; inf if that is all of the image."""
-        radius = min(_BEFORE_FOLD * self._fold_radius, math.tan(_WIDEST))
-        around = radius * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-        shown = float(np.linalg.norm(self.distort(around) - self.principal_point, axis=1).min())
+        radius = min(_BEFORE_FOLD * self._fold_radius, math.tan(self._steep_angle))
+        shown = float(self._radii_px(np.array([radius]))[0])
         corners = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]) * self._last_pixel
         return shown if np.linalg.norm(corners - self.principal_point, axis=1).max() > shown else math.inf
+
+    @cached_property
+    def _steep_angle(self) -> float:
+        """Angle off the axis [rad] up to which steps of the angle are long enough in the image."""
+        angles = np.linspace(0.0, _WIDEST, _ANGLES)
+        short = np.diff(self._radii_px(np.tan(angles))) < _LEAST_STEP * self.focal_px * angles[1]
+        return float(angles[np.argmax(short)]) if short.any() else _WIDEST
+
+    def _radii_px(self, radii: FloatArray) -> FloatArray:
+        """Distances (R,) [px] from the principal point of normalised radii (R,), the least of four directions."""
+        around = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+        at = self.distort(radii[:, None, None] * around)
+        return np.asarray(np.linalg.norm(at - self.principal_point, axis=-1).min(axis=1))
 
     @cached_property
     def _fold_radius(self) -> float:

@@ -151,6 +151,18 @@ def test_pixels_beyond_what_the_lens_can_show(model, D, radius):
     assert camera.shows(uv[0])
 
 
+def test_a_lens_that_nearly_folds_back_shows_nothing_from_there_on():
+    """Its slope falls to 0.006 at a radius of 1.65 and rises again: beyond, pixels say nothing of directions."""
+    camera = Camera(640, 512, np.array([[392.0, 0, 320], [0, 392.0, 256], [0, 0, 1]]), 'plumb_bob', [-0.243, 0.0268])
+    radii = np.linspace(0.0, 1.7, 1701)
+    px = camera.distort(radii[:, None] * [1.0, 0.0])
+    last = radii[camera.shows(px)][-1]
+    step = (camera.distort([[last + 1e-4, 0.0]]) - camera.distort([[last, 0.0]]))[0, 0] / 1e-4
+    # Steps of the angle, in the image, over those in the middle; the angle is found to half a degree.
+    assert abs(step * (1.0 + last**2) / 392.0 - 0.2) < 0.02
+    assert not camera.shows([639.0, 0.0])
+
+
 @every_model
 def test_a_lens_shows_all_of_its_image(name):
     assert CAMERAS[name].shows([[0.0, 0.0], [639.0, 0.0], [639.0, 511.0], [1e6, 0.0]]).all()

@@ -193,7 +193,7 @@ def followed(
     likeness = decoder.likeness(frame.image, shown)
     similarity = likeness.correlation * np.sign(last.cnr)
     alike = (likeness.best == 4 * last.ids) & (similarity > _STILL_SIMILAR)
-    alike &= frame.camera.contains(shown).all(axis=1)
+    alike &= (frame.camera.contains(shown) & frame.camera.shows(shown)).all(axis=1)
     certain = similarity >= config.guided_min_correlation
     certain &= similarity - likeness.runner_up >= config.guided_min_margin
     found = FoundMarkers(last.ids, places, last.cnr, np.ones(len(alike), dtype=bool), certain)
