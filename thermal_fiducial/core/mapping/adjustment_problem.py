@@ -108,9 +108,13 @@ class Linearised:
         """Robust weights (n,) of the views, for corners of ``scale`` times their variance."""
         return robust(self.chi2, CHI2_OF_VIEW * scale)[1]
 
+    def view_costs(self, scale: float) -> FloatArray:
+        """Robust chi squares (n,) of the views, for corners of ``scale`` times their variance."""
+        return robust(self.chi2, CHI2_OF_VIEW * scale)[0]
+
     def cost(self, scale: float) -> float:
         """Robust sum of squares."""
-        of_views = np.sum(robust(self.chi2, CHI2_OF_VIEW * scale)[0])
+        of_views = np.sum(self.view_costs(scale))
         of_cameras = np.sum(robust(self.camera_chi2, CHI2_OF_POSE)[0])
         return float(of_views + of_cameras + np.sum(self.marker_chi2))
 
@@ -204,10 +208,9 @@ class MapProblem:
 
     def markers_stepped(self, now: Linearised, scale: float) -> Poses:
         """After one Gauss-Newton step of each marker alone."""
-        of_marker = now.weights(scale)[:, None, None] * np.swapaxes(now.J_marker, -1, -2)
-        information = self.over_markers(of_marker @ now.J_marker)
-        information += (TINY * np.max(information, axis=(1, 2), keepdims=True) + TINY) * np.eye(6)
-        steps = np.linalg.solve(information, self.over_markers(of_marker @ now.r[..., None]))
+        blocks, _, side = self.normal(now, scale)
+        largest = np.max(blocks.marker, axis=(1, 2), keepdims=True)
+        steps = np.linalg.solve(blocks.marker + (TINY * largest + TINY) * np.eye(6), side)
         return Poses(now.state.T_map_camera, retract(now.state.T_map_marker, steps[..., 0]))
 
     @property

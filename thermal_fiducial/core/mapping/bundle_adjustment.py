@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import CHI2_OF_VIEW, noise_factor
-from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, robust, STIFFENED
+from thermal_fiducial.core.error_model import noise_factor
+from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Snapshot
 from thermal_fiducial.core.mapping.candidates import UNAMBIGUOUS
 from thermal_fiducial.core.mapping.error_sources import ErrorSources
@@ -90,8 +90,8 @@ def _with_mirrored(problem: MapProblem, now: Linearised) -> Linearised | None:
     for _ in range(_MIRRORED_STEPS):
         other = problem.markers_stepped(problem.evaluate(other), scale)
     mirrored = problem.evaluate(other)
-    costs = (problem.over_markers(robust(at.chi2, CHI2_OF_VIEW * scale)[0]) for at in (now, mirrored))
-    better = next(costs) - next(costs) > UNAMBIGUOUS * scale
+    gains = problem.over_markers(now.view_costs(scale) - mirrored.view_costs(scale))
+    better = gains > UNAMBIGUOUS * scale
     better &= ~problem.held & ~problem.known.information.any(axis=(1, 2))
     if not better.any():
         return None

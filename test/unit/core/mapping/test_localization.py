@@ -23,6 +23,20 @@ def located(T, poses, rows, prior=None):
     return locate(0, sight, CAMERA, prior, MODEL)
 
 
+def look_at_one(rng, offset):
+    """Poses of a map of one marker, and T_map_camera of a camera that looks at it from ``offset`` (3,)."""
+    poses = {0: wall(rng, tilt=0.0)[0]}
+    centre = poses[0][:3, 3]
+    return poses, look(centre + np.array(offset), centre)
+
+
+def far_and_noisy():
+    """A map of one marker, and its rows from so far that two poses of the camera are possible."""
+    rng = np.random.default_rng(2)
+    poses, T = look_at_one(rng, [-9.0, 0.2, 0.0])
+    return poses, T, see(T, poses, 0.3, rng)
+
+
 def known_to(T, position_std, rotation_std):
     """A prior."""
     return CameraPose(0, T, np.diag(np.repeat((position_std**2, rotation_std**2), 3)))
@@ -44,11 +58,7 @@ def test_a_marker_that_was_moved_loses_its_weight_and_hardly_moves_the_pose():
 
 
 def test_the_pose_that_is_nearer_to_the_prior_settles_the_ambiguity_of_a_far_marker():
-    rng = np.random.default_rng(2)
-    poses = {0: wall(rng, tilt=0.0)[0]}
-    centre = poses[0][:3, 3]
-    T = look(centre + np.array([-9.0, 0.2, 0.0]), centre)
-    rows = see(T, poses, 0.3, rng)
+    poses, T, rows = far_and_noisy()
     unsettled = located(T, poses, rows)
     assert isinstance(unsettled, Refusal)
     assert unsettled.reason == 'planar ambiguity of marker 0 unsettled'
@@ -62,11 +72,7 @@ def test_the_pose_that_is_nearer_to_the_prior_settles_the_ambiguity_of_a_far_mar
 
 def test_a_prior_counts_by_what_it_is_worth():
     """Of two poses 20 degrees apart it chooses if it knows the attitude to a degree, not if it knows a radian."""
-    rng = np.random.default_rng(2)
-    poses = {0: wall(rng, tilt=0.0)[0]}
-    centre = poses[0][:3, 3]
-    T = look(centre + np.array([-9.0, 0.2, 0.0]), centre)
-    rows = see(T, poses, 0.3, rng)
+    poses, T, rows = far_and_noisy()
     likelier, other = located(T, poses, rows).viewpoint.T_map_camera
 
     def chosen(rotation_std):
@@ -82,9 +88,7 @@ def test_a_marker_seen_from_the_front_claims_what_its_attitude_is_worth():
     nees = []
     for seed in range(300):
         rng = np.random.default_rng(seed)
-        poses = {0: wall(rng, tilt=0.0)[0]}
-        centre = poses[0][:3, 3]
-        T = look(centre + np.array([-5.0, 0.0, 0.0]), centre)
+        poses, T = look_at_one(rng, [-5.0, 0.0, 0.0])
         outcome = located(T, poses, see(T, poses, 0.1, rng))
         if isinstance(outcome, Location):
             turn = difference(T, outcome.pose.T_map_camera)[3:]
@@ -100,9 +104,7 @@ def test_a_pose_by_a_wrong_aspect_ratio_claims_what_it_is_worth():
     nees = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
-        poses = {0: wall(rng, tilt=0.0)[0]}
-        centre = poses[0][:3, 3]
-        T = look(centre + np.array([-2.0, 1.0, 0.0]), centre)
+        poses, T = look_at_one(rng, [-2.0, 1.0, 0.0])
         sight = Sight.of(Observations.of(see(T, poses, 0.05, rng)), MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
         outcome = locate(0, sight, calibrated, known_to(T, 0.1, 0.02), MODEL)
         d = difference(T, outcome.pose.T_map_camera)
