@@ -29,8 +29,12 @@ from thermal_fiducial.core.geometry.planar_pose import ippe_square
 from thermal_fiducial.core.geometry.se3 import diagonals
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS
 
-# Polarity: memory in frames, and the surplus of markers of one polarity from which on it is certain.
+# Polarity: memory in frames that show markers, and the surplus of markers of one polarity from which on it is certain.
 _FRAMES, _SURE = 30, 6.0
+# The same without markers [s]: half a minute until a certain polarity is open again. Sheets take minutes to become
+# colder than what is behind them; and the first marker after a gap is often in motion blur, in which the plate around a
+# dark marker resembles a bright one.
+_REMEMBERED_S = 20.0
 # Share of the predicted map markers that must be found for the prediction to count as right.
 _ENOUGH = 0.5
 # Longest time between blind searches [s] without a map or with a wrong prediction: every other frame at 30 Hz, every
@@ -45,7 +49,7 @@ class FrameHistory:
     """What a frame needs from the frames before it."""
 
     track: MotionTrack
-    #: surplus of dark over bright markers, with exponential forgetting
+    #: surplus of dark over bright markers, with exponential forgetting, at most that of one marker a frame
     balance: float = 0.0
     #: whether the last frame showed markers that are partially visible
     saw_partial: bool = False
@@ -58,8 +62,16 @@ class FrameHistory:
     ) -> 'FrameHistory':
         """The history that the frame after one with this twist and these markers starts from."""
         track = self.track.after(stamp_ns, twist, markers)
-        balance = self.balance + float(np.sign(markers.cnr).sum()) - self.balance / _FRAMES
+        balance = self._balance_after(stamp_ns, float(np.sign(markers.cnr).sum()))
         return FrameHistory(track, balance, saw_partial, self.searched_ns, self.scales)
+
+    def _balance_after(self, stamp_ns: int, surplus: float) -> float:
+        """The balance after a frame with a ``surplus`` of dark over bright markers."""
+        if surplus != 0.0:
+            return float(np.clip(self.balance * (1.0 - 1.0 / _FRAMES) + surplus, -_FRAMES, _FRAMES))
+        before_ns = self.track.stamp_ns
+        elapsed_ns = 0 if before_ns is None else max(stamp_ns - before_ns, 0)
+        return self.balance * math.exp(-elapsed_ns / (_REMEMBERED_S * SECOND_NS))
 
     def searched_within(self, stamp_ns: int, seconds: float) -> bool:
         """Whether the last blind search was less than ``seconds`` before a frame; not so if stamps went back."""
