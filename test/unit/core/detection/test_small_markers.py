@@ -1,5 +1,6 @@
 """Markers whose cells are hardly wider than the blur."""
 
+import cv2
 import numpy as np
 import pytest
 from support.opencv import opencv_detector, opencv_dictionary
@@ -118,11 +119,13 @@ def test_small_markers_in_counts_have_their_size_in_and_out_of_focus(side, tilt_
 
 @pytest.mark.parametrize('cells', [3, 5, 6])
 def test_other_squares_are_no_markers(cells):
-    """Random bits in a black border, of as many cells as no marker of this dictionary has."""
-    dictionary = load_dictionary('DICT_4X4_50')
-    for seed in range(4):
-        picture = with_other_squares(np.random.default_rng(seed), cells, 8 + 2 * seed)
-        assert detected(dictionary, picture)['id'].tolist() == []
+    """Random bits in a black border, of as many cells as no marker of this dictionary has: 480 squares."""
+    dictionary, found = load_dictionary('DICT_4X4_50'), []
+    for seed in range(40):
+        picture = with_other_squares(np.random.default_rng(seed), cells, 8 + 2 * (seed % 4))
+        found.extend(detected(dictionary, picture)['id'].tolist())
+    # 2, 1 and 0 when this was written: a hundredth of a marker is expected in each of the pictures.
+    assert len(found) <= 2
 
 
 def test_leaves_are_no_markers():
@@ -212,14 +215,42 @@ def test_faint_markers_do_not_pay_for_a_surface_that_is_even():
 @pytest.mark.parametrize('optics_px', [0.45, 0.9])
 def test_fits_from_near_and_from_far_end_at_the_same_size(optics_px):
     """From near, the pattern is modelled once, with the blur of a camera in focus; from far several times."""
-    dictionary, rng = load_dictionary('STENCIL_4X4_100'), np.random.default_rng(5)
+    dictionary, ratios = load_dictionary('STENCIL_4X4_100'), []
     decoder = Decoder(dictionary.bits, dictionary.correctable)
-    counts, corners = counts_with_markers(rng, dictionary.bits, 20, 0.0, optics_px=optics_px)
-    view, true, ids = PatternView(counts.astype(np.float32)), np.array(list(corners.values())), np.array(list(corners))
-    far = fit_patterns(view, true + rng.uniform(-1.0, 1.0, true.shape), ids, decoder, BLUR_PX)
-    near = fit_patterns(view, true, ids, decoder, BLUR_PX)
-    # 0.0005 and 0.0002 when this was written; 0.0015 and 0.0055 where the pattern stays that of a camera in focus.
-    assert np.abs(sizes(near.corners_px) / sizes(far.corners_px) - 1.0).max() < 0.001
+    for seed in range(5, 9):
+        rng = np.random.default_rng(seed)
+        counts, corners = counts_with_markers(rng, dictionary.bits, 20, 0.0, optics_px=optics_px)
+        view, true, ids = (
+            PatternView(counts.astype(np.float32)),
+            np.array(list(corners.values())),
+            np.array(list(corners)),
+        )
+        far = fit_patterns(view, true + rng.uniform(-1.0, 1.0, true.shape), ids, decoder, BLUR_PX)
+        near = fit_patterns(view, true, ids, decoder, BLUR_PX)
+        ratios.append(sizes(near.corners_px) / sizes(far.corners_px) - 1.0)
+    # 0.0004 and 0.0001 when this was written; 0.0014 and 0.0048 where the pattern stays that of a camera in focus.
+    assert np.sqrt(np.mean(np.concatenate(ratios) ** 2)) < 0.0007
+
+
+def test_smoke_as_fine_as_markers_is_in_the_claims():
+    """It hides a third of their warmth, and changes by a third of that within 20 px."""
+    dictionary, errors, squares = load_dictionary('DICT_4X4_50'), [], []
+    decoder = Decoder(dictionary.bits, dictionary.correctable)
+    for seed in range(6):
+        rng = np.random.default_rng([seed, 9])
+        counts, corners = counts_with_markers(rng, dictionary.bits, 16, 0.0, optics_px=0.6)
+        coarse = rng.normal(0.0, 1.0, (HEIGHT // 20 + 1, WIDTH // 20 + 1))
+        hidden = 0.3 * (1.0 + 0.3 * cv2.resize(coarse, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC))
+        image = (counts - hidden * (counts - float(counts.min()))).astype(np.float32)
+        true, ids = np.array(list(corners.values())), np.array(list(corners))
+        fit = fit_patterns(PatternView(image), true, ids, decoder, BLUR_PX)
+        error = (fit.corners_px - true).reshape(-1, 8, 1)
+        errors.append(error)
+        squares.append((error.swapaxes(1, 2) @ np.linalg.solve(fit.covariance, error)).ravel() / 8.0)
+    # 0.026 px when this was written, 0.053 where the level behind a marker is linear.
+    assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.03
+    # 2.9, 3.6 where residuals are independent beyond a blur, 11 with a linear level besides. Without smoke 0.9.
+    assert np.concatenate(squares).mean() < 3.3
 
 
 def test_a_lens_that_bends_lines_displaces_no_small_marker():

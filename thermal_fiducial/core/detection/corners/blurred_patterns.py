@@ -9,7 +9,7 @@ it.
 
 All that is linear is part of the model. The warm surface and the sheet before it each have a temperature that is linear
 across the marker, so level and contrast are. The surface may be warmest in its middle, and may end one cell outside the
-marker.
+marker; and smoke in front makes the level a little quadratic.
 """
 
 from functools import cache
@@ -34,8 +34,11 @@ CORNERS, BLUR, LINEAR = slice(0, 8), 8, slice(9, None)
 #: Place of the bowl of the warm surface among the linear terms, and among the parameters; its value at the corners.
 BOWL = 4
 BOWL_AMOUNT, BOWL_AT_CORNERS = LINEAR.start + BOWL, 0.5
+#: The same of the curvatures of the level.
+LEVEL = slice(5, 8)
+LEVEL_AMOUNTS, LEVEL_AT_CORNERS = slice(LINEAR.start + LEVEL.start, LINEAR.start + LEVEL.stop), 0.25
 # Places among the linear terms of the gradients of the contrast, and of what gain control adds.
-_GRADIENTS, _OF_GAIN_CONTROL = slice(1, 3), slice(5, None)
+_GRADIENTS, _OF_GAIN_CONTROL = slice(1, 3), slice(LEVEL.stop, None)
 # Longest row of places that OpenCV interpolates at once.
 _LONGEST_ROW = 2**15 - 1
 # Cumulative standard normal distribution, by a table.
@@ -64,6 +67,8 @@ class PatternGrid(NamedTuple):
     #: (2, P) places from the middle, in sides, and their squared distances (P,) from there
     middle: Float32Array
     bowl: Float32Array
+    #: (3, P) quadratic functions of these places: the curvatures of a level
+    curvatures: Float32Array
     #: samples of a cell
     density: int
     #: whether contrast is linear across the marker, else constant
@@ -86,8 +91,10 @@ def pattern_grid(cells: int, density: int, *, bent: bool = False) -> PatternGrid
     background = np.linalg.qr(np.stack([*linear, a * a, a * b, b * b] if bent else linear, axis=1))[0]
     weights, middle = bilinear(a, b).astype(np.float32), np.stack([a, b]).astype(np.float32) - np.float32(0.5)
     bowl = (middle * middle).sum(axis=0)
+    curvatures = np.stack([middle[0] * middle[0], middle[0] * middle[1], middle[1] * middle[1]])
     nodes = (_of_nodes(b)[:, None] * _of_nodes(a)).reshape(-1, a.size).astype(np.float32)
-    return PatternGrid(along, weights, nodes, background.astype(np.float32), middle, bowl, density, graded=not bent)
+    background = background.astype(np.float32)
+    return PatternGrid(along, weights, nodes, background, middle, bowl, curvatures, density, graded=not bent)
 
 
 def _of_nodes(share: FloatArray) -> FloatArray:
@@ -271,8 +278,8 @@ def _linear_terms(
 ) -> Float32Array:
     """Linear terms (Q, L, P): the pattern; where the contrast is graded its gradients, and end and bowl of the surface.
 
-    The bowl shows through the white cells alone. In a picture for a display also what a quadratic function of the
-    counts adds between black and white.
+    The bowl shows through the white cells alone, what curves the level is before all cells. In a picture for a display
+    also what a quadratic function of the counts adds between black and white.
     """
     if not grid.graded:
         return model.value[:, None]
@@ -283,7 +290,8 @@ def _linear_terms(
     x, y = _between(outside, grid.along, np.sqrt(np.einsum('qii->iq', spread)))
     surface = (y[:, :, None] * x[:, None]).reshape(len(spread), 1, -1)
     bowl = grid.bowl * (1.0 + model.value) + 2.0 * (grid.middle * displaced).sum(axis=1)
-    terms = [model.value[:, None], graded, surface, bowl[:, None]]
+    level = np.broadcast_to(grid.curvatures, (len(spread), *grid.curvatures.shape))
+    terms = [model.value[:, None], graded, surface, bowl[:, None], level]
     if displayed:
         terms.append((model.value * (1.0 + model.value))[:, None])
     return np.concatenate(terms, axis=1)

@@ -39,6 +39,10 @@ OF_UNEVEN_CONTRAST_PX = 0.7
 #: over sqrt(k t / h), for t = 2 to 1 mm of aluminium, k = 200 W/(m K), h = 20 W/(m2 K) of still air and radiation on
 #: both sides (F. Incropera, D. DeWitt, "Fundamentals of Heat and Mass Transfer", on fins).
 SURFACE_FALLS = 0.1
+#: Standard deviation of what the level in the corners of a marker is off a linear one, as a share of the contrast, by
+#: smoke before it. Behind smoke that hides 0.6 of the warmth and changes by a third of that within 20 px, any larger
+#: value leaves the same errors of clear markers, and faint ones pay for it without smoke.
+LEVEL_BENDS = 0.03
 #: A side by a gradient of the contrast across it [px^2]: a step with a slope on one side, fitted as a step blurred by
 #: 0.75 px in pixels up to four blurs away, is displaced by 1.4 to 2.0 px^2 times the slope over the step. The slope
 #: looks like contrast too [px]: a step of nothing has 2 px of the slope. Both grow with the distance of the pixels.

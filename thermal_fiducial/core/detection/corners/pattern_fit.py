@@ -21,12 +21,20 @@ from thermal_fiducial.core.detection.corners.blurred_patterns import (
     BOWL_AMOUNT,
     BOWL_AT_CORNERS,
     CORNERS,
+    LEVEL,
+    LEVEL_AMOUNTS,
+    LEVEL_AT_CORNERS,
     linearised,
     pattern_grid,
     PatternResiduals,
     PatternView,
 )
-from thermal_fiducial.core.detection.corners.corner_errors import OF_DISPLAYED_PATTERN_PX, OF_PATTERN_PX, SURFACE_FALLS
+from thermal_fiducial.core.detection.corners.corner_errors import (
+    LEVEL_BENDS,
+    OF_DISPLAYED_PATTERN_PX,
+    OF_PATTERN_PX,
+    SURFACE_FALLS,
+)
 from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.detection.patterns import Decoder
@@ -65,7 +73,7 @@ _FOCUS, _START = 0.3, 0.5
 # Parameters of a fit: corners, blur, contrast, warm surface, background. A fit to something that is not there makes use
 # of fewer, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 it is higher
 # below 8.
-_PARAMETERS, _OF_CHANCE = 17, 9
+_PARAMETERS, _OF_CHANCE = 20, 9
 # Least share of the variance that counts as left: no model is better.
 _LEAST = 1e-6
 # Residuals over the noise of a pixel beyond which they are more than noise.
@@ -93,6 +101,7 @@ class _Prior(NamedTuple):
         precision, off = self._precision(at), np.zeros(at.J.shape[:2])
         off[:, CORNERS] = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
         off[:, BLUR], off[:, BOWL_AMOUNT] = at.blur - self.blur_px, at.amounts[:, BOWL]
+        off[:, LEVEL_AMOUNTS] = at.amounts[:, LEVEL]
         information = by_samples.copy()
         np.einsum('qii->qi', information)[:] += precision
         return _solvable(information), _gradient(at) + (precision * off)[..., None]
@@ -102,7 +111,9 @@ class _Prior(NamedTuple):
         precision = np.zeros(at.J.shape[:2])
         precision[:, CORNERS] = 1.0 / self.corners_std[:, None] ** 2
         precision[:, BLUR] = 1.0 / (_FOCUS * self.blur_px) ** 2
-        precision[:, BOWL_AMOUNT] = 1.0 / ((SURFACE_FALLS / BOWL_AT_CORNERS * at.contrast) ** 2 + TINY)
+        of_contrast = 1.0 / (at.contrast * at.contrast + TINY)
+        precision[:, BOWL_AMOUNT] = (BOWL_AT_CORNERS / SURFACE_FALLS) ** 2 * of_contrast
+        precision[:, LEVEL_AMOUNTS] = (LEVEL_AT_CORNERS / LEVEL_BENDS) ** 2 * of_contrast[:, None]
         return precision * _variance_of_samples(at, self.blur_px)[:, None]
 
 
@@ -186,10 +197,7 @@ def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: D
     # The last step is so short that it changes residuals linearly.
     hidden = grid.without_background((at.J.swapaxes(1, 2) @ move[..., None].astype(np.float32))[..., 0])
     at = at._replace(rest=at.rest + hidden)
-    share = _variance_of_samples(at, blur_px)
-    covariance = np.linalg.inv(information)[:, CORNERS, CORNERS] * share[:, None, None]
-    # From u of all corners and v of all of them to u and v of each.
-    covariance = covariance.reshape(-1, 2, 4, 2, 4).transpose(0, 2, 1, 4, 3).reshape(-1, 8, 8)
+    covariance = _covariance(at, information, blur_px)
     return PatternFit(quads, covariance, at.contrast, np.sqrt(_noise_variance(at, blur_px)), step, at)
 
 
@@ -234,6 +242,37 @@ def _variance_of_samples(at: PatternResiduals, blur_px: float) -> FloatArray:
 def _independent(at: PatternResiduals, blur_px: float) -> FloatArray:
     """Number (Q,) of independent values: pixels over what blur averages over, its noise-equivalent area."""
     return np.asarray(at.pixels / (4.0 * math.pi * np.minimum(at.blur, blur_px) ** 2))
+
+
+def _covariance(at: PatternResiduals, information: FloatArray, blur_px: float) -> FloatArray:
+    """Covariance (Q, 8, 8) of the corners [px^2], by the ``information`` (Q, K, K) of samples with a variance of 1.
+
+    Neighbouring pixels that the model misses, it misses together: within a blur, or within a cell if that is more, as
+    behind smoke.
+    """
+    inverse: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    variance = np.maximum(_variance_of_samples(at, blur_px), _variance_by_cells(at, inverse))
+    covariance = inverse[:, CORNERS, CORNERS] * variance[:, None, None]
+    # From u of all corners and v of all of them to u and v of each.
+    return np.asarray(covariance.reshape(-1, 2, 4, 2, 4).transpose(0, 2, 1, 4, 3).reshape(-1, 8, 8))
+
+
+def _variance_by_cells(at: PatternResiduals, inverse: FloatArray) -> FloatArray:
+    """Variance (Q,) that samples would have if each cell missed the model as a whole, independently of the others.
+
+    The squares of what the residuals of single cells move the corners by are added (K.-Y. Liang, S. Zeger,
+    "Longitudinal data analysis using generalized linear models", 1986). These cells begin in the middle of the
+    pattern's. ``inverse`` (Q, K, K): of the information.
+    """
+    count, parameters = at.J.shape[:2]
+    density = at.grid.density
+    cells = len(at.grid.along) // density
+    moves = at.grid.without_background(inverse[:, CORNERS].astype(np.float32) @ at.J) * at.rest[:, None]
+    moved = moves.reshape(count, -1, cells, density, cells, density).sum(axis=(3, 5))
+    # So much of what cells miss is left by a fit of so many parameters.
+    left = 1.0 - parameters / cells**2
+    claimed = np.maximum(np.trace(inverse[:, CORNERS, CORNERS], axis1=1, axis2=2), TINY)
+    return np.asarray((moved * moved).sum(axis=(1, 2, 3)) / (left * claimed), dtype=np.float64)
 
 
 def _gradient(at: PatternResiduals) -> FloatArray:
