@@ -174,7 +174,7 @@ def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
 _READOUT = tuple(f'prediction.frame:{name}' for name in ('delays', 'stretch', 'displacement', 'rolling_displacement'))
 _SCALES = _place('finding.search:SearchScales')
 _ALL_IN_THE_SEARCH = {'finding.finder:_next_scales': lambda *_, **__: _SCALES.ALL}
-_DISPLAYED = 'confirmation:DisplayedSides', 'confirmation:_outward'
+_DISPLAYED = 'confirmation:DisplayedSides', 'confirmation:_lag_across', 'confirmation:_corners_by_pairs'
 _BORDER_WIDTH = {'confirmation:DisplayedSides.corrected': lambda _, __, refined, ___: refined.corners}
 
 MECHANISMS = {

@@ -2,9 +2,10 @@
 
 A marker is confirmed by the correlation of its pattern. A gain control for displays is a nonlinear function of the
 counts. The middle between the gray levels of black and white is then not the middle of the blurred step between them:
-all dark regions grow, or all shrink. The sides of a marker and the inner edges of its border move in opposite
-directions, so the width of the border measures the displacement. Markers whose cells are hardly wider than the blur are
-refined by fitting the whole pattern, and confirmed by the evidence of that fit or by their pattern like the others.
+all dark regions grow, or all shrink, and along the motion of a marker more than across it. The sides of a marker and
+the inner edges of its border move in opposite directions, so the width of the border measures the displacement. Markers
+whose cells are hardly wider than the blur are refined by fitting the whole pattern, and confirmed by the evidence of
+that fit or by their pattern like the others.
 """
 
 from dataclasses import replace
@@ -16,7 +17,9 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.corner_errors import (
     BLURRED_OUT,
     OF_BENT_BLUR_PX,
+    OF_BENT_LAG,
     OF_BENT_SCALE_PX,
+    OF_BORDER_LAG,
     OF_BORDER_PX,
     OF_BORDERS_TOGETHER,
     OF_LOCAL_PX,
@@ -27,7 +30,7 @@ from thermal_fiducial.core.detection.corners.segments import measure, REACHED, S
 from thermal_fiducial.core.detection.corners.sides import blur_of, edges_behind_border, model, sides_of
 from thermal_fiducial.core.detection.finding.quads import halfway, halved
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
-from thermal_fiducial.core.detection.prediction.frame import counts_of, Frame
+from thermal_fiducial.core.detection.prediction.frame import counts_of, Frame, MotionBlur
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
@@ -101,16 +104,23 @@ class DisplayedSides:
         if len(refined.ids) == 0:
             return refined.corners
         segments = self._across_border(frame, refined, blur_px)
-        known = segments.variance < UNMEASURED
-        weight = np.where(known, 1.0 / (OF_BORDERS_TOGETHER * (segments.variance + OF_BORDER_PX**2)), 0.0)
+        normals = _normals(refined.corners.corners_px)
+        lag_px = _lag_across(normals, refined.blur)
+        by_pair = (len(lag_px), 2, -1)
+        shift, variance = segments.shift.reshape(by_pair), segments.variance.reshape(by_pair)
+        of_border = OF_BORDER_PX**2 + (OF_BORDER_LAG * lag_px[..., None]) ** 2
+        weight = np.where(variance < UNMEASURED, 1.0 / (OF_BORDERS_TOGETHER * (variance + of_border)), 0.0)
         # Sides displaced outward by 1 scale the pattern, so that the inner edges appear displaced inward by ``gain``.
         gain = 2.0 - 2.0 / (self._bits + 2.0)
-        information = gain * gain * weight.sum(axis=1)
-        variance = 1.0 / (information + OF_BENT_SCALE_PX**-2)
-        displacement = variance * gain * np.sum(weight * segments.shift, axis=1)
-        outward = _outward(refined.corners.corners_px)
-        corners = refined.corners.corners_px - displacement[:, None, None] * outward
-        unknown = _CORNERS * variance[:, None, None, None] * outward[..., :, None] * outward[..., None, :]
+        information = gain * gain * weight.sum(axis=2)
+        # At rest all sides are displaced alike. In motion white gives way to black more slowly, or faster, than black
+        # to white: what that displaces opposite sides by, both outward or both inward, the other two do not have.
+        prior = OF_BENT_SCALE_PX**2 + (OF_BENT_LAG * lag_px[..., None]) ** 2 * np.eye(2)
+        covariance = np.linalg.solve(np.eye(2) + prior * information[:, None], prior)
+        displacement = covariance @ (gain * (weight * shift).sum(axis=2))[..., None]
+        by_pairs = _corners_by_pairs(normals)
+        corners = refined.corners.corners_px - (by_pairs @ displacement[:, None])[..., 0]
+        unknown = _CORNERS * by_pairs @ covariance[:, None] @ by_pairs.swapaxes(-1, -2)
         unknown = unknown + OF_BENT_BLUR_PX**2 * np.eye(2)
         return replace(refined.corners, corners_px=corners, covariances=refined.corners.covariances + unknown)
 
@@ -128,13 +138,27 @@ class DisplayedSides:
         return measure(counts, modelled._replace(counting=counting), REACHED * blur.width)
 
 
-def _outward(corners: FloatArray) -> FloatArray:
-    """Displacement (N, 4, 2) of the corners (N, 4, 2) of quadrilaterals whose sides all move outward by 1."""
+def _normals(corners: FloatArray) -> FloatArray:
+    """Outward unit normals (N, 4, 2) of the sides that begin at the corners (N, 4, 2) of quadrilaterals."""
     side = np.roll(corners, -1, axis=1) - corners
     side = side / np.linalg.norm(side, axis=-1, keepdims=True)
-    normal = np.stack([side[..., 1], -side[..., 0]], axis=-1)
-    before = np.roll(normal, 1, axis=1)
-    return np.asarray((normal + before) / (1.0 + np.sum(normal * before, axis=-1, keepdims=True)))
+    return np.stack([side[..., 1], -side[..., 0]], axis=-1)
+
+
+def _lag_across(normals: FloatArray, blur: MotionBlur) -> FloatArray:
+    """Motion blur (N, 2) of two pairs of opposite sides with ``normals`` (N, 4, 2), across them [px]."""
+    across = np.abs(normals @ (blur.shift + blur.removed).mean(axis=1)[..., None])[..., 0]
+    return np.asarray(0.5 * (across[:, :2] + across[:, 2:]))
+
+
+def _corners_by_pairs(normals: FloatArray) -> FloatArray:
+    """Derivatives (N, 4, 2, 2) of corners by how far outward the two pairs of opposite sides are displaced."""
+    before = np.roll(normals, 1, axis=1)
+    cosine = np.sum(normals * before, axis=-1, keepdims=True)
+    by_next, by_last = normals - cosine * before, before - cosine * normals
+    even = (np.arange(4) % 2 == 0)[:, None]
+    pairs = np.stack([np.where(even, by_next, by_last), np.where(even, by_last, by_next)], axis=-1)
+    return np.asarray(pairs / (1.0 - cosine * cosine)[..., None])
 
 
 def confirmed(

@@ -23,12 +23,17 @@ OF_DISPLAYED_PATTERN_PX = 0.05
 #: A side in a picture for a display, a nonlinear function of the counts [px]: if its middle gray lies anywhere between
 #: a fifth and four fifths of the original step, a step blurred by 0.66 px is displaced by up to 0.55, evenly spread.
 OF_BENT_SCALE_PX = 0.3
+#: Two opposite sides there by the lag, along the motion, as a share of the motion blur: where white has decayed to that
+#: gray by -log f of the time constant, black has risen to it after -log(1 - f), and half of the difference is 0.38 rms.
+OF_BENT_LAG = 0.4
 #: A corner there, after the correction by the width of the border [px]: motion blur is distorted too.
 OF_BENT_BLUR_PX = 0.1
 #: A segment of a border there, and how much larger the variance of their mean is than if segments erred by themselves:
 #: of rendered frames after the Tau 2's plateau equalisation, errors of the displacement found are 3 to 4 of the sigmas
 #: that independent segments would have, of markers of 14 to 60 px seen at up to 70 degrees.
 OF_BORDER_PX, OF_BORDERS_TOGETHER = 0.05, 12.0
+#: The same as a share of the motion blur: without it, borders in 4 to 8 px of blur were off by 7 of their sigmas.
+OF_BORDER_LAG = 0.05
 #: Corners of a marker whose contrast is uneven, by smoke before it or by what it hangs in front of [px over the share
 #: by which the contrast changes from cell to cell]. A blurred step whose contrast has a slope, fitted without one in
 #: pixels up to a cell away, is displaced by 0.7 of what the contrast changes in a cell; a slope of the level displaces
