@@ -4,6 +4,7 @@
 # make coverage  all tests, with the branch coverage of the core: less than 95 % fails
 # make bench     accuracy and speed against OpenCV and a batch smoother, in the same run
 # make faults    faults of IMU, camera, markers and nodes in flights of eight seeds, as a table for the documents
+# make rigs      random rigs, rooms and motions from pictures on: medians, the worst, and which are beyond their claims
 # make soak      an hour of flight in real time: memory, CPU and error by the minute
 # make restart   how long a node that is killed in flight takes to be back
 # make fuzz      10,000 mutated messages, files and bags for the nodes and commands; anything found is an error
@@ -30,7 +31,7 @@ QUIET_PIP := PYTHONWARNINGS='ignore:Editable installation'
 # A test that hangs ends with the stacks of its threads instead of the run; the longest takes 20 s, beside eight loops 3 min.
 LIMIT := --timeout 600 --timeout-method thread
 
-.PHONY: help demo test lint nightly coverage bench faults soak restart fuzz latency tables structure docs format clean
+.PHONY: help demo test lint nightly coverage bench faults rigs soak restart fuzz latency tables structure docs format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -74,6 +75,10 @@ bench: $(READY)
 faults: $(READY)
 	@echo '== Faults in flight: about an hour on two cores; fewer flights: make faults FAULTS_ARGS="--seeds 1"'
 	PYTHONPATH=test $(BIN)/python -m faults $(FAULTS_ARGS); ended=$$?; $(BIN)/python test/documents.py && exit $$ended
+
+rigs: $(READY)
+	@echo '== Random rigs from pictures on: a minute each on a core; other seeds: make rigs RIGS_ARGS="20 100"'
+	PYTHONPATH=test $(BIN)/python -m rigs $(or $(RIGS_ARGS),0 20)
 
 soak: $(READY)
 	@echo '== An hour of flight in real time; shorter: make soak SOAK_ARGS="--minutes 6"'
