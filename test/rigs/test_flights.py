@@ -24,6 +24,9 @@ NIGHTLY = (
     (12, SECONDS, (45.4, 49.7)),
     # Plateau, take-off behind smoke.
     (83, SECONDS, (5.3, 16.7)),
+    # Raw, 9 Hz, hovering before small markers behind smoke, which leaves their poses noisy: 175 mm and a reset where
+    # those of the noisiest poses are the views that place new markers.
+    (3, SECONDS, (9.2, 67.3)),
 )
 FLIGHTS = [SHORT, *(pytest.param(*flight, marks=pytest.mark.nightly) for flight in NIGHTLY)]
 

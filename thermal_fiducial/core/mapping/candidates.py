@@ -22,6 +22,9 @@ from thermal_fiducial.core.types import FloatArray
 
 #: Least angle between the directions of views that are kept [rad]: closer ones do not resolve the ambiguity.
 MIN_SEPARATION = np.deg2rad(1.0)
+#: Standard deviation of a view's camera, as a share of that of a view from about the same direction, below which it
+#: takes its place. If any better one did, a view would follow a moving camera, and there would never be three.
+BETTER = 0.35
 MIN_VIEWS = 3
 #: Views kept of a candidate, which bounds the cost of the fit.
 MAX_VIEWS = 16
@@ -48,17 +51,31 @@ class Candidate:
     untried: int = 0
 
     def add(self, view: MarkerView) -> None:
-        """Keep ``view`` if its direction is new, or in place of a view of the same frame with an older camera pose."""
+        """Keep ``view`` if its direction is new, or in place of a view of the same frame with an older camera pose.
+
+        Or in place of one from about the same direction whose camera pose is known far less well: directions by such
+        poses differ most, so that the worst views would be kept, and hide the good ones between them.
+        """
         stamps = [kept.stamp_ns for kept in self.views]
         if view.stamp_ns in stamps:
             self.views[stamps.index(view.stamp_ns)] = view
-        elif self.views and np.max(self._directions @ view.direction) > np.cos(MIN_SEPARATION):
-            return
-        else:
+        elif (like := self._from_the_same_direction(view)) is None:
             self.views.append(view)
+        elif view.viewpoint.turn_std < BETTER * self.views[like].viewpoint.turn_std:
+            self.views[like] = view
+        else:
+            return
         self.untried += 1
         if len(self.views) > MAX_VIEWS:
             self._drop_most_redundant()
+
+    def _from_the_same_direction(self, view: MarkerView) -> int | None:
+        """Index of the kept view that ``view`` is nearest to, if the two are too near to be two."""
+        if not self.views:
+            return None
+        cosines = self._directions @ view.direction
+        nearest = int(np.argmax(cosines))
+        return nearest if cosines[nearest] > np.cos(MIN_SEPARATION) else None
 
     def place(self, camera: Camera, errors: SystematicErrors) -> MapMarker | str:
         """The marker in the map if the views determine it uniquely, else what it waits for, in words."""

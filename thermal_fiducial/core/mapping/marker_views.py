@@ -51,6 +51,11 @@ class Viewpoint:
         """The one or two (k, 4, 4) different poses."""
         return self.T_map_camera if np.any(self.T_map_camera[0] != self.T_map_camera[1]) else self.T_map_camera[:1]
 
+    @cached_property
+    def turn_std(self) -> float:
+        """Standard deviation of the better known pose's attitude, by noise [rad]."""
+        return float(np.sqrt(np.trace(self.covariances[:, 3:, 3:], axis1=1, axis2=2).min()))
+
     @classmethod
     def known(
         cls, T_map_camera: FloatArray, covariance: FloatArray, draws: FloatArray, scales: FloatArray = NO_SCALES

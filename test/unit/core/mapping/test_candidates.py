@@ -41,6 +41,17 @@ def test_a_start_through_a_camera_is_no_marker(gap):
     assert 'marker 7' in reason
 
 
+@pytest.mark.parametrize(('covariance', 'kept', 'untried'), [(1e-5, [1, 2], 3), (5e-4, [0, 2], 2)])
+def test_of_two_views_from_one_direction_one_that_is_known_far_better_is_kept(covariance, kept, untried):
+    """The first camera's attitude is known to 3 degrees, so its direction is as good as any within them."""
+    candidate = Candidate(7, SIZE)
+    candidate.add(view(0, np.eye(4)))
+    candidate.add(view(1, transform(so3_exp([0.01, 0.0, 0.0]), np.zeros(3)), covariance))
+    candidate.add(view(2, transform(so3_exp([0.1, 0.0, 0.0]), np.zeros(3))))
+    assert [one.stamp_ns for one in candidate.views] == kept
+    assert candidate.untried == untried
+
+
 def test_views_of_another_calibration_keep_their_directions():
     """A camera that is calibrated anew in flight, to another size of the image: the pixels of before mean others."""
     half = replace(CAMERA, width=CAMERA.width // 2, height=CAMERA.height // 2, K=CAMERA.K * [[0.51], [0.49], [1.0]])
