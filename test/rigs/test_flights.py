@@ -37,8 +37,8 @@ def test_poses_and_maps_are_within_their_claims(seed, seconds, measured_mm):
     for score, rms_mm in zip(scores, measured_mm, strict=True):
         assert score.false_mapped == 0
         # NEES at worst 1.3 of poses and 0.4 of maps, and nothing beyond 3 sigma. A filter and a mapper that take focal
-        # length and extrinsics for exact are beyond these bounds in four of the six: NEES 5, 15, 2.7, 2.1, and up to
-        # 48 % beyond 3 sigma.
+        # length and extrinsics for exact are beyond these bounds in four of the first six: NEES 5, 15, 2.7, 2.1, and up
+        # to 48 % beyond 3 sigma.
         assert score.poses.nees < MOST_NEES
         assert score.poses.beyond < MOST_BEYOND
         assert score.markers.count == 0 or score.markers.nees < MOST_NEES

@@ -31,14 +31,13 @@ _SURFACE_ENDS = 1.0
 #: Parameters of a fit: u of the corners and v of them, blur, and amounts of the linear terms; the first of these is the
 #: contrast.
 CORNERS, BLUR, LINEAR = slice(0, 8), 8, slice(9, None)
-#: Place of the bowl of the warm surface among the linear terms, and among the parameters; its value at the corners.
-BOWL = 4
-BOWL_AMOUNT, BOWL_AT_CORNERS = LINEAR.start + BOWL, 0.5
-#: The same of the curvatures of the level.
-LEVEL = slice(5, 8)
-LEVEL_AMOUNTS, LEVEL_AT_CORNERS = slice(LINEAR.start + LEVEL.start, LINEAR.start + LEVEL.stop), 0.25
-# Places among the linear terms of the gradients of the contrast, and of what gain control adds.
-_GRADIENTS, _OF_GAIN_CONTROL = slice(1, 3), slice(LEVEL.stop, None)
+#: Places among the linear terms, and among the parameters, of what is uneven by little: the bowl of the warm surface
+#: and the curvatures of the level; their values at the corners.
+UNEVEN = slice(4, 8)
+UNEVEN_AMOUNTS = slice(LINEAR.start + UNEVEN.start, LINEAR.start + UNEVEN.stop)
+UNEVEN_AT_CORNERS = np.array([0.5, 0.25, 0.25, 0.25])
+# Places among the linear terms of the gradients of the contrast, of the bowl, and of what gain control adds.
+_GRADIENTS, _BOWL, _OF_GAIN_CONTROL = slice(1, 3), UNEVEN.start, slice(UNEVEN.stop, None)
 # Longest row of places that OpenCV interpolates at once.
 _LONGEST_ROW = 2**15 - 1
 # Cumulative standard normal distribution, by a table.
@@ -90,8 +89,8 @@ def pattern_grid(cells: int, density: int, *, bent: bool = False) -> PatternGrid
     linear = [np.ones_like(a), a, b]
     background = np.linalg.qr(np.stack([*linear, a * a, a * b, b * b] if bent else linear, axis=1))[0]
     weights, middle = bilinear(a, b).astype(np.float32), np.stack([a, b]).astype(np.float32) - np.float32(0.5)
-    bowl = (middle * middle).sum(axis=0)
     curvatures = np.stack([middle[0] * middle[0], middle[0] * middle[1], middle[1] * middle[1]])
+    bowl = curvatures[0] + curvatures[2]
     nodes = (_of_nodes(b)[:, None] * _of_nodes(a)).reshape(-1, a.size).astype(np.float32)
     background = background.astype(np.float32)
     return PatternGrid(along, weights, nodes, background, middle, bowl, curvatures, density, graded=not bent)
@@ -238,7 +237,7 @@ def _contrast(amounts: Float32Array, model: PatternModel, grid: PatternGrid, *, 
     """White minus black (Q, P or 1) where the samples are, by the amounts (Q, L) of the linear terms."""
     if not grid.graded:
         return amounts
-    contrast = amounts[:, :1] + amounts[:, _GRADIENTS] @ grid.middle + amounts[:, BOWL, None] * grid.bowl
+    contrast = amounts[:, :1] + amounts[:, _GRADIENTS] @ grid.middle + amounts[:, _BOWL, None] * grid.bowl
     if displayed:
         contrast += amounts[:, _OF_GAIN_CONTROL] * (1.0 + 2.0 * model.value)
     return np.asarray(contrast)

@@ -17,17 +17,14 @@ import numpy as np
 
 from thermal_fiducial.core.detection.corners.blurred_patterns import (
     BLUR,
-    BOWL,
-    BOWL_AMOUNT,
-    BOWL_AT_CORNERS,
     CORNERS,
-    LEVEL,
-    LEVEL_AMOUNTS,
-    LEVEL_AT_CORNERS,
     linearised,
     pattern_grid,
     PatternResiduals,
     PatternView,
+    UNEVEN,
+    UNEVEN_AMOUNTS,
+    UNEVEN_AT_CORNERS,
 )
 from thermal_fiducial.core.detection.corners.corner_errors import (
     LEVEL_BENDS,
@@ -70,9 +67,11 @@ _LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.3, (0.5, 2.0)
 # Standard deviation of the blur, in blurs of the optics: the focus. That of the corners from where they are looked for
 # [cells].
 _FOCUS, _START = 0.3, 0.5
-# Parameters of a fit: corners, blur, contrast, warm surface, background. A fit to something that is not there makes use
-# of fewer, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 it is higher
-# below 8.
+# Standard deviations of what is uneven by little, at the corners, as shares of the contrast.
+_UNEVEN_STD = np.array([SURFACE_FALLS, LEVEL_BENDS, LEVEL_BENDS, LEVEL_BENDS])
+# Parameters of a fit: corners, blur, contrast, warm surface, level, background. A fit to something that is not there
+# makes use of fewer, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 it
+# is higher below 8.
 _PARAMETERS, _OF_CHANCE = 20, 9
 # Least share of the variance that counts as left: no model is better.
 _LEAST = 1e-6
@@ -100,8 +99,7 @@ class _Prior(NamedTuple):
         """
         precision, off = self._precision(at), np.zeros(at.J.shape[:2])
         off[:, CORNERS] = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
-        off[:, BLUR], off[:, BOWL_AMOUNT] = at.blur - self.blur_px, at.amounts[:, BOWL]
-        off[:, LEVEL_AMOUNTS] = at.amounts[:, LEVEL]
+        off[:, BLUR], off[:, UNEVEN_AMOUNTS] = at.blur - self.blur_px, at.amounts[:, UNEVEN]
         information = by_samples.copy()
         np.einsum('qii->qi', information)[:] += precision
         return _solvable(information), _gradient(at) + (precision * off)[..., None]
@@ -112,8 +110,7 @@ class _Prior(NamedTuple):
         precision[:, CORNERS] = 1.0 / self.corners_std[:, None] ** 2
         precision[:, BLUR] = 1.0 / (_FOCUS * self.blur_px) ** 2
         of_contrast = 1.0 / (at.contrast * at.contrast + TINY)
-        precision[:, BOWL_AMOUNT] = (BOWL_AT_CORNERS / SURFACE_FALLS) ** 2 * of_contrast
-        precision[:, LEVEL_AMOUNTS] = (LEVEL_AT_CORNERS / LEVEL_BENDS) ** 2 * of_contrast[:, None]
+        precision[:, UNEVEN_AMOUNTS] = (UNEVEN_AT_CORNERS / _UNEVEN_STD) ** 2 * of_contrast[:, None]
         return precision * _variance_of_samples(at, self.blur_px)[:, None]
 
 
