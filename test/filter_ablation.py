@@ -16,7 +16,7 @@ from support.filter_scenes import Figures, SCENES
 from support.taken_out import ablation_row, lines_of
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.pose_noise import LIMITS, WHITE
+from thermal_fiducial.core.filter.pose_noise import LIMITS
 from thermal_fiducial.core.filter.update import body_pose
 
 FILTER = 'thermal_fiducial.core.filter'
@@ -83,7 +83,7 @@ MECHANISMS = {
     ),
     'size of white errors is learned': Mechanism(
         ('noise of poses', 'lasting errors'),
-        off={'pose_noise:LIMITS': _limits_with(0, WHITE)},
+        off={'pose_noise:LIMITS': _limits_with(0, 1.0)},
     ),
     'jitter of stamps': Mechanism(('jittering',), changes={'stamp_jitter': 0.0}),
     'jitter is learned': Mechanism(

@@ -18,7 +18,6 @@ from support.flights import (
     run,
     START_NS,
     timeline,
-    white_poses,
 )
 
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
@@ -210,7 +209,7 @@ def clock_error(seed, imu_noise, declared):
     """Error of the clock offset and what is claimed of it [s]."""
     data = gentle(seed, imu_noise, LEARNED + 0.3)
     samples, poses = with_declared_errors(data) if declared else (data.samples(), data.poses)
-    ekf = PoseEkf(white_poses(imu=imu_noise))
+    ekf = PoseEkf(config(imu=imu_noise))
     run(ekf, timeline(samples, poses, LATE + data.offset))
     learned = ekf.diagnostics()
     return learned['time offset'] - data.offset, learned['time offset std']
@@ -219,7 +218,7 @@ def clock_error(seed, imu_noise, declared):
 def false_steps(seed):
     """How often a minute of flight looks like a step of the camera's clock, which there is not."""
     data = gentle(seed, IMU, 60.0, imu_rate=100.0)
-    rng, ekf = np.random.default_rng(seed), PoseEkf(white_poses())
+    rng, ekf = np.random.default_rng(seed), PoseEkf(config())
     later = LATER * rng.uniform(size=len(data.poses)) * (rng.uniform(size=len(data.poses)) < LATE_SHARE)
     steps, before = 0, None
     for item in timeline(data.samples(), data.poses, LATE + data.offset + later):

@@ -21,7 +21,6 @@ from support.flights import (
     run,
     START_NS,
     timeline,
-    white_poses,
 )
 
 from thermal_fiducial.config import ImuNoise
@@ -191,7 +190,7 @@ def test_noise_of_the_imu_is_not_taken_for_a_time_offset(density):
     for seed in range(6):
         motion = Motion.random(np.random.default_rng(100 + seed), speed=0.25, turn=0.12)
         data = Flight(seed, 12.0, motion, imu_rate=RATE, imu_noise=noise, offset=0.03 * (-1) ** seed)
-        _, _, ekf, _ = flown(data, white_poses(imu=noise))
+        _, _, ekf, _ = flown(data, config(imu=noise))
         numbers = ekf.diagnostics()
         ratios.append((numbers['time offset'] - data.offset) / numbers['time offset std'])
     # the 99 % limit of the mean of six squares
@@ -208,7 +207,7 @@ def first_seconds():
     for seed in range(6):
         motion = Motion.random(np.random.default_rng(seed), turn=1.0)
         data = Flight(seed, 3.0, motion, imu_rate=RATE, offset=0.03 * (-1) ** seed, **GOOD_POSES)
-        ekf = PoseEkf(white_poses())
+        ekf = PoseEkf(config())
         states, _ = run(ekf, timeline(data.samples(), data.poses, 0.03))
         T_true = data.motion.pose([seconds_of(state) for state in states])
         for state, T in zip(states, T_true, strict=True):

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from support import real_flights
 from support.corner_runs import fly, published, rms
-from support.flights import errors, Flight, in_order, Motion, run_watched, START_NS, timeline, white_poses
+from support.flights import config, errors, Flight, in_order, Motion, run_watched, START_NS, timeline
 from support.sim_flights import simulated
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
@@ -125,11 +125,11 @@ LATE = 0.03
 
 def _arrivals(flight: Flight, poses: list[CameraPose], samples: list[ImuSample] | None = None, **rest: Any) -> Arrivals:
     gaps = rest.pop('gaps', ())
-    config = white_poses(**rest)
+    parameters = config(**rest)
     begin = [START_NS + round(1e9 * (a - flight.offset)) for a, _ in gaps]
     end = [START_NS + round(1e9 * (b - flight.offset)) for _, b in gaps]
     kept = [pose for pose in poses if not any(a <= pose.stamp_ns < b for a, b in zip(begin, end, strict=True))]
-    return Arrivals(flight, timeline(samples or flight.samples(), kept, LATE + flight.offset), config, gaps)
+    return Arrivals(flight, timeline(samples or flight.samples(), kept, LATE + flight.offset), parameters, gaps)
 
 
 def brisk(seed: int) -> Arrivals:
@@ -239,7 +239,7 @@ def starved(seed: int) -> Arrivals:
         elif rng.random() < 0.5:
             arrivals.append((held_ns + round(rng.exponential(0.1e9)), pose))
     arrivals.sort(key=lambda arrival: arrival[0])
-    return Arrivals(flight, [item for _, item in arrivals], white_poses())
+    return Arrivals(flight, [item for _, item in arrivals], config())
 
 
 def jittering(seed: int) -> Arrivals:
@@ -321,7 +321,7 @@ def stepping_clock(seed: int, step_ns: int = 300_000_000) -> Arrivals:
         items.append((pose.stamp_ns + round(1e9 * LATE), 1, replace(pose, stamp_ns=pose.stamp_ns + step)))
     samples = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
     ordered = [item for _, _, item in sorted(samples + items, key=lambda entry: entry[:2])]
-    return Arrivals(flight, ordered, white_poses())
+    return Arrivals(flight, ordered, config())
 
 
 def small_step_of_clock(seed: int) -> Arrivals:

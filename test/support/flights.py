@@ -10,7 +10,6 @@ import numpy as np
 
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.filter.pose_noise import WHITE
 from thermal_fiducial.core.geometry.se3 import (
     rotation_angle,
     skew,
@@ -145,17 +144,11 @@ def matched(**changes) -> PoseEkfConfig:
         'mount_vibration': 0.0,
         'map_tilt_std': 0.0,
         'systematic_pose_std': 0.01,
-        'pose_noise_scale': WHITE**-0.5,
         'initial_gyroscope_bias_std': 0.005,
         'initial_accelerometer_bias_std': 0.05,
         'imu': MATCHED_IMU,
     }
     return config(**(exact | changes))
-
-
-def white_poses(**changes) -> PoseEkfConfig:
-    """The shipped parameters for poses whose covariance is that of their white error alone, as these flights' is."""
-    return config(**({'pose_noise_scale': WHITE**-0.5} | changes))
 
 
 def perfect(noise: ImuNoise) -> ImuNoise:

@@ -137,7 +137,7 @@ def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
         now = state.derivative(innovation.motion.imu)
         state = state.moved((before - now) * error[TIME_OFFSET])
         covariance = _in_clock_of_imu(config, covariance, now, innovation)
-    noise = replace(adapted_noise(innovation), last=innovation.pose)
+    noise = replace(adapted_noise(innovation), last=innovation.pose.seen_from(state.T_map_body))
     return replace(prior, state=state, covariance=covariance, pose_noise=noise)
 
 
@@ -157,8 +157,9 @@ def with_unknown_clock(config: PoseEkfConfig, covariance: FloatArray) -> FloatAr
 def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estimate:
     """The estimate with the systematic error of poses propagated to the view of ``pose``: first-order Markov."""
     last = estimate.pose_noise.last
-    alike = pose.correlation(last, config.systematic_angle)
-    of_view = config.systematic_pose_std**2 * pose.shape
+    alike = pose.seen_from(estimate.state.T_map_body).correlation(last, config.systematic_angle)
+    share = estimate.pose_noise.lasting
+    of_view = share * config.systematic_pose_std**2 * pose.shape
     # Changes of the map's error are in the systematic error too.
     most = of_view + pose.of_map
     P = estimate.covariance.copy()

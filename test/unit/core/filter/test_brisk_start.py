@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.flights import config, Flight, Motion, run, timeline, white_poses
+from support.flights import config, Flight, Motion, run, timeline
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
 
@@ -25,7 +25,7 @@ def shaken_by_hand(seed):
 def test_a_start_in_brisk_motion_is_right_at_once(seed, pose_rate):
     """Linearised about an offset of 0, the estimate refused up to 5 good poses, and an alternative replaced it."""
     flight = Flight(seed, 3.0, shaken_by_hand(seed), pose_rate=pose_rate, offset=OFFSET, **POSES)
-    ekf = PoseEkf(white_poses())
+    ekf = PoseEkf(config())
     states, updates = run(ekf, timeline(flight.samples(), flight.poses, LATE + OFFSET))
     assert ekf.resets == 0
     assert not any(update.refused for update in updates)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from support.corner_runs import rms
-from support.flights import config, errors, Flight, in_order, run_watched, START_NS, timeline, white_poses
+from support.flights import config, errors, Flight, in_order, run_watched, START_NS, timeline
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid
@@ -183,7 +183,7 @@ def test_a_dead_gyroscope_does_not_change_the_clock_offset(seed):
     dead = slice(1000, 1200)
     samples = flight.samples()
     samples[dead] = [replace(s, angular_velocity=1e-6 * rng.normal(size=3)) for s in samples[dead]]
-    ekf, deviations = PoseEkf(white_poses()), []
+    ekf, deviations = PoseEkf(config()), []
     for item in timeline(samples, flight.poses, LATE):
         if not isinstance(item, ImuSample):
             ekf.add_pose(item)

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 from support.estimates import difference
-from support.flights import config, errors, Flight, matched, Motion, run, START_NS, timeline, white_poses
+from support.flights import config, errors, Flight, matched, Motion, run, START_NS, timeline
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.state import TIME_OFFSET
@@ -115,7 +115,7 @@ def test_an_imu_that_measures_no_gravity_is_named(motion, factor):
 
 def test_a_gyroscope_in_degrees_is_named_where_no_flight_can_begin():
     flight = Flight(seed=1, seconds=4.0)
-    ekf, said = PoseEkf(white_poses()), set()
+    ekf, said = PoseEkf(config()), set()
     wrong = [replace(s, angular_velocity=np.degrees(s.angular_velocity)) for s in flight.samples()]
     for item in timeline(wrong, flight.poses, 0.03):
         if isinstance(item, ImuSample):
@@ -133,7 +133,7 @@ def test_a_gyroscope_in_degrees_is_named_where_no_flight_can_begin():
 
 
 def test_live_parameters_hold_from_then_on(short_flight):
-    ekf, flight = PoseEkf(white_poses()), short_flight
+    ekf, flight = PoseEkf(config()), short_flight
     arrivals = timeline(flight.samples(), flight.poses, 0.03)
     half = len(arrivals) // 2
     _, before = run(ekf, arrivals[:half])

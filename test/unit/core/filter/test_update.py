@@ -119,6 +119,21 @@ def test_the_systematic_error_is_part_of_the_measurement(estimate, still):
     np.testing.assert_allclose(shown, 4.0 * pose.shape, rtol=1e-9, atol=1e-15)
 
 
+def test_noise_of_poses_is_no_change_of_the_view(estimate, still):
+    """Of a far marker, whose poses scatter by 3 deg: what it is wrong by stays while the robot is where it was."""
+    R = np.diag(np.repeat((0.05, 0.15), 3) ** 2)
+    here, now = estimate.state.T_map_body, known(estimate)
+    now.covariance[SYSTEMATIC, SYSTEMATIC] = R
+    now = replace(now, pose_noise=PoseNoise.of(BodyPose(here, R)))
+    for turn, shift in ((0.05, -0.1), (-0.06, 0.15), (0.04, 0.1)):
+        pose = BodyPose(here @ transform(so3_exp([turn, -turn, 0.0]), [shift, 0.0, shift]), R)
+        innovation = innovation_of(FULL, now, pose, still)
+        # All but what updates move the estimate by, which knows where it is; a third by noisy poses.
+        np.testing.assert_allclose(innovation.prior.state.systematic, now.state.systematic, rtol=1e-4, atol=1e-9)
+        now = corrected(FULL, innovation)
+    assert np.linalg.norm(now.state.systematic) > 0.01
+
+
 def test_a_pose_after_a_long_gap_places_the_robot_where_it_says(estimate, still):
     """Position off by 10 m, attitude by 27 mrad, a pose good to a millimetre whose attitude is half believed."""
     state = estimate.state
@@ -235,6 +250,16 @@ def test_an_error_that_lasts_is_no_white_one(estimate, still, size):
     errors = np.zeros((30, 6))
     errors[10:] = size
     assert learned_white(estimate, still, errors) == WHITE
+
+
+def test_what_is_known_to_be_white_does_not_last():
+    noise = PoseNoise.of(ELSEWHERE)
+    # At first all of it may be either.
+    assert noise.lasting == 1.0
+    known = np.array([1e9, 0.0, 0.0])
+    for white, lasting in ((0.2, 0.8), (1.0, 0.0), (7.0, 0.0)):
+        learned = replace(noise, variances=np.array([white, 0.0, 0.0]), information=known)
+        assert learned.lasting == pytest.approx(lasting, abs=1e-6)
 
 
 def test_another_view_has_another_systematic_error():
