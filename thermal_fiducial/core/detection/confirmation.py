@@ -4,8 +4,8 @@ A marker is confirmed by the correlation of its pattern. A gain control for disp
 counts. The middle between the gray levels of black and white is then not the middle of the blurred step between them:
 all dark regions grow, or all shrink, and along the motion of a marker more than across it. The sides of a marker and
 the inner edges of its border move in opposite directions, so the width of the border measures the displacement. Markers
-whose cells are hardly wider than the blur are refined by fitting the whole pattern, and confirmed by the evidence of
-that fit or by their pattern like the others.
+that are not large there are refined by fitting the whole pattern, which needs no correction. Those whose cells are
+hardly wider than the blur are confirmed by the evidence of that fit or by their pattern like the others.
 """
 
 from dataclasses import replace

@@ -100,14 +100,14 @@ def test_what_a_display_displaces_the_border_shows(frames, bent):
     assert nees < 2.0
 
 
-@pytest.mark.parametrize(('bent', 'allowed'), [(0.35, 0.056), (3.0, 0.13)])
-def test_what_a_display_does_to_motion_blur_borders_show(bent, allowed):
+@pytest.mark.parametrize(('bent', 'allowed'), [(0.35, 0.04), (3.0, 0.13)])
+def test_what_a_display_does_to_motion_blur_patterns_show(bent, allowed):
     """In 2 px of it, black takes longer to give way to white than white to black, or the other way round."""
     frames = list(render_frames('fast', seconds=20.0, seed=5, start=440, stop=444))
     rows = last_rows(frames, lambda counts: displayed(counts, bent), 'fast')
     error = corners_px(rows) - np.stack([frames[-1].corners_px[marker_id] for marker_id in rows['id'].tolist()])
     shape = error - error.mean(axis=1, keepdims=True)
-    # 0.043 and 0.103 px when this was written, 0.069 and 0.158 where all sides are displaced alike.
+    # 0.026 and 0.105 px when this was written; by the width of borders 0.043 and 0.103, by one width 0.069 and 0.158.
     assert np.sqrt(np.mean(shape**2)) < allowed
 
 

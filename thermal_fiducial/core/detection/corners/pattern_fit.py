@@ -46,8 +46,12 @@ _FALSE_MARKERS = 0.01
 # Width of cells, in blurs of the optics, below which whole patterns are fitted: at 7 a frame of 45 markers would take
 # twice the time.
 _NARROW = 6.0
-# Largest distance of samples [px], and least number of them along a cell: 0.85 px gives no better corners.
-_APART_PX, _FEWEST = 1.0, 3
+# The same in pictures for a display, where only the whole pattern shows what gain control makes of its edges. Behind
+# smoke, fits of patterns with cells of 13 to 17 blurs are worse than those of sides, whose contrast is local.
+_NARROW_ON_DISPLAYS = 11.0
+# Distance of samples [px]: 0.85 px gives no better corners; and least and largest number of them along a cell. With
+# four, cells of 8 px are not always found; with six, corners in pictures for a display are no better.
+_APART_PX, _FEWEST, _MOST = 1.0, 3, 5
 # Steps of a fit, and length of the step of a corner after which there is no further one [px]. Size and focus converge
 # slowly together: 0.03 px would leave 0.2 per mille more of the size of 22 px.
 _STEPS, _CONVERGED_PX = 8, 0.02
@@ -137,6 +141,12 @@ def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> B
     return np.asarray(narrow_sides(corners_px) < _NARROW * blur_px * cells)
 
 
+def are_fitted_whole(corners_px: FloatArray, cells: int, blur_px: float, *, displayed: bool) -> BoolArray:
+    """Which markers (N, 4, 2) are refined by their whole patterns: small ones, and larger ones on a display."""
+    blurs = _NARROW_ON_DISPLAYS if displayed else _NARROW
+    return np.asarray(narrow_sides(corners_px) < blurs * blur_px * cells)
+
+
 def fitted_patterns(
     frame: Frame,
     found: FoundMarkers,
@@ -145,7 +155,7 @@ def fitted_patterns(
     decoder: Decoder,
     blur_px: float,
 ) -> RefinedCorners:
-    """Corners of N small markers by their patterns.
+    """Corners of N markers by their patterns, and of small ones what evidence of the markers these are.
 
     Parameters
     ----------
@@ -163,18 +173,19 @@ def fitted_patterns(
     doubt = np.where(fit.step_px > _CONVERGED_PX, np.maximum(doubt, fit.step_px**2), doubt)
     off = np.abs(corners - start.px).max(axis=(1, 2)) * decoder.cells / sides_px(start.px)
     covariances, fitted = square.corner_covariances + floor**2 * _EYE, np.ones(len(doubt), dtype=bool)
-    evident, refuted = found.certain & (off < _NEAR), ~fitted
-    others = np.flatnonzero(~evident)
+    small = too_small_for_sides(start.px, decoder.cells, blur_px)
+    evident, refuted = small & found.certain & (off < _NEAR), ~fitted
+    others = np.flatnonzero(small & ~evident)
     if len(others):
         evident[others], refuted[others] = _verdicts(fit, found, others, frame, decoder, blur_px)
-    return RefinedCorners(corners, covariances, fit.contrast, fit.noise, doubt, fitted, evident, refuted)
+    return RefinedCorners(corners, covariances, fit.contrast, fit.noise, doubt, fitted, small, evident, refuted)
 
 
 def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: Decoder, blur_px: float) -> PatternFit:
     """Fits of the markers ``ids`` (Q,), upright in ``quads`` (Q, 4, 2), which are accurate to half a cell."""
     white, blur = decoder.patterns(ids, np.zeros_like(ids)), np.full(len(ids), blur_px)
     cell = sides_px(quads) / decoder.cells
-    grid = pattern_grid(decoder.cells, max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX)))
+    grid = pattern_grid(decoder.cells, min(max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX)), _MOST))
     prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
     at = linearised(view, quads, blur, white, grid)
     by_samples = at.information()

@@ -5,8 +5,8 @@ The camera's twist gives the motion blur of each marker. Where it is large, the 
 subtracted from the corners. The corners then correct the twist; if that changes the blur much, the refinement is
 repeated.
 
-Corners are those of the fitted sides (:mod:`side_fit`), or of the whole pattern where markers are small
-(:mod:`pattern_fit`).
+Corners are those of the fitted sides (:mod:`side_fit`), or of the whole pattern where markers are small, or not large
+in a picture for a display (:mod:`pattern_fit`).
 """
 
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.blurred_patterns import lens_bends, PatternView
 from thermal_fiducial.core.detection.corners.corner_errors import of_motion_blur, unknown_motion
-from thermal_fiducial.core.detection.corners.pattern_fit import fitted_patterns, too_small_for_sides
+from thermal_fiducial.core.detection.corners.pattern_fit import are_fitted_whole, fitted_patterns
 from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.corners.side_fit import OF_CLEAR, OF_FAINT, refine_corners
 from thermal_fiducial.core.detection.patterns import Decoder
@@ -90,9 +90,9 @@ def refine(
     for _ in range(_ROUNDS):
         blur = motion_blur(frame, places, twist)
         start = places.at.at_pixels(places.at.px + blur.shift)
-        small = too_small_for_sides(start.px, decoder.cells, config.blur_px)
-        if small.any():
-            refined = _with_small(frame, found, start, blur, behind, columns, small, decoder, config)
+        by_pattern = are_fitted_whole(start.px, decoder.cells, config.blur_px, displayed=frame.displayed)
+        if by_pattern.any():
+            refined = _with_patterns(frame, found, start, blur, behind, columns, by_pattern, decoder, config)
         else:
             refined = refine_corners(frame.image, start, frame.camera, behind, config.blur_px, columns, blur)
         markers = _at_stamp(frame, found.ids, places, blur, refined, twist, track, behind.shape[2])
@@ -103,30 +103,29 @@ def refine(
     return markers
 
 
-def _with_small(
+def _with_patterns(
     frame: Frame,
     found: FoundMarkers,
     start: ImagePoints,
     blur: MotionBlur,
     behind: Float32Array,
     columns: int,
-    small: BoolArray,
+    by_pattern: BoolArray,
     decoder: Decoder,
     config: ArucoDetectorConfig,
 ) -> RefinedCorners:
-    """Corners of N markers in the image: of ``small`` ones (N,) by the whole pattern, of the others by their sides."""
-    moving, large = blur.only(small), ~small
-    there = start.only(small)
+    """Corners of N markers in the image: some (N,) by the whole pattern, the others by their sides."""
+    moving, by_sides = blur.only(by_pattern), ~by_pattern
+    there = start.only(by_pattern)
     bends = lens_bends(there, frame.camera)
     view = PatternView(frame.image, moving.to_tails, moving.spread, frame.displayed, bends)
-    fitted = fitted_patterns(frame, found.only(small), there, view, decoder, config.blur_px)
-    if small.all():
+    fitted = fitted_patterns(frame, found.only(by_pattern), there, view, decoder, config.blur_px)
+    if by_pattern.all():
         return fitted
-    by_sides = refine_corners(
-        frame.image, start.only(large), frame.camera, behind[large], config.blur_px, columns, blur.only(large)
-    )
-    order = np.argsort(np.concatenate([np.flatnonzero(large), np.flatnonzero(small)]))
-    return by_sides.joined(fitted).only(order)
+    others, of_sides = start.only(by_sides), blur.only(by_sides)
+    refined = refine_corners(frame.image, others, frame.camera, behind[by_sides], config.blur_px, columns, of_sides)
+    order = np.argsort(np.concatenate([np.flatnonzero(by_sides), np.flatnonzero(by_pattern)]))
+    return refined.joined(fitted).only(order)
 
 
 def _at_stamp(
@@ -151,7 +150,7 @@ def _at_stamp(
         sure = np.ones(len(ids), dtype=bool)
         if frame.displayed:
             # What looks like a small marker may be another thing.
-            sure = refined.evident | ~refined.by_pattern
+            sure = refined.evident | ~refined.small
         twist = track.correct(frame.stamp_ns, frame.twist, ids[sure], at.x[sure], places.depth[sure], deviation[sure])
     if twist is None:
         unsure = doubted + _of_unpredicted_motion(frame, places, refined, UNKNOWN_TWIST, cells)
@@ -161,7 +160,7 @@ def _at_stamp(
     lag_blur = places.lag_blur(twist, frame.lag)
     rolling = rolling_displacement(places, twist, frame, (refined.corners_px + blur.removed)[..., 1])
     px = refined.corners_px - lag_blur + blur.removed - rolling
-    unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur)
+    unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur, displayed=frame.displayed)
     if frame.twist is None:
         unknown = unknown + _of_unpredicted_motion(frame, places, refined, twist, cells)
     corners = replace(refined, corners_px=px, covariances=doubted + unknown)
