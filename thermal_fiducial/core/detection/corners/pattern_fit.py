@@ -49,8 +49,8 @@ _NARROW = 6.0
 # The same in pictures for a display, where only the whole pattern shows what gain control makes of its edges. Behind
 # smoke, fits of patterns with cells of 13 to 17 blurs are worse than those of sides, whose contrast is local.
 _NARROW_ON_DISPLAYS = 11.0
-# Distance of samples [px]: 0.85 px gives no better corners; and least and largest number of them along a cell. With
-# four, cells of 8 px are not always found; with six, corners in pictures for a display are no better.
+# Distance of samples [px]: 0.85 px gives no better corners; and least number of them along a cell, and largest in
+# pictures for a display. With four, cells of 8 px there are not always found; with six, corners are no better.
 _APART_PX, _FEWEST, _MOST = 1.0, 3, 5
 # Steps of a fit, and length of the step of a corner after which there is no further one [px]. Size and focus converge
 # slowly together: 0.03 px would leave 0.2 per mille more of the size of 22 px.
@@ -185,7 +185,8 @@ def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: D
     """Fits of the markers ``ids`` (Q,), upright in ``quads`` (Q, 4, 2), which are accurate to half a cell."""
     white, blur = decoder.patterns(ids, np.zeros_like(ids)), np.full(len(ids), blur_px)
     cell = sides_px(quads) / decoder.cells
-    grid = pattern_grid(decoder.cells, min(max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX)), _MOST))
+    density = max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX))
+    grid = pattern_grid(decoder.cells, min(density, _MOST) if view.displayed else density)
     prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
     at = linearised(view, quads, blur, white, grid)
     by_samples = at.information()
