@@ -138,12 +138,15 @@ def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> B
 
     Of a marker that is turned away the cells are narrow along one direction only, and that is what counts.
     """
-    return np.asarray(narrow_sides(corners_px) < _NARROW * blur_px * cells)
+    return _have_cells_below(_NARROW, corners_px, cells, blur_px)
 
 
 def are_fitted_whole(corners_px: FloatArray, cells: int, blur_px: float, *, displayed: bool) -> BoolArray:
     """Which markers (N, 4, 2) are refined by their whole patterns: small ones, and larger ones on a display."""
-    blurs = _NARROW_ON_DISPLAYS if displayed else _NARROW
+    return _have_cells_below(_NARROW_ON_DISPLAYS if displayed else _NARROW, corners_px, cells, blur_px)
+
+
+def _have_cells_below(blurs: float, corners_px: FloatArray, cells: int, blur_px: float) -> BoolArray:
     return np.asarray(narrow_sides(corners_px) < blurs * blur_px * cells)
 
 
