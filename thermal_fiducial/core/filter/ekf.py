@@ -116,6 +116,10 @@ class PoseEkf:
 
         ``pose.stamp_ns`` is in the camera's clock; the clock offset, parameter and estimate, is added here.
         """
+        update = self._add_pose(pose)
+        return replace(update, stamp_ns=pose.stamp_ns)
+
+    def _add_pose(self, pose: CameraPose) -> PoseUpdate:
         off_grid_ns = self._frame_grid.off_grid(pose.stamp_ns) if self._config.estimate_time_offset else 0
         if self._T_map_first is not None:
             pose = in_moved_map(pose, inverse(self._T_map_first))
@@ -163,15 +167,22 @@ class PoseEkf:
             self._history.take_in()
 
     def _contradicts(self, pose: CameraPose) -> bool:
-        """Whether poses with this stamp cannot be used: the last one was refused, or the stamp is out of range."""
+        """Whether a pose cannot be used with this stamp: as the last one it is refused, or its stamp is out of range.
+
+        A pose that can be used has come later than usual; another one before it was wrong.
+        """
         main = self._history.main
-        ahead = self._history.due_ns(pose, main) > self._history.imu.newest_ns
-        return main is not None and (main.accepted_in_row == 0 or ahead or bool(self._unusable(pose)))
+        if main is None:
+            return False
+        if self._history.due_ns(pose, main) > self._history.imu.newest_ns or self._unusable(pose):
+            return True
+        innovation = self._history.compared(pose)
+        return main.accepted_in_row == 0 and (innovation is None or innovation.nis > self._config.gate)
 
     def _fits(self, pose: CameraPose) -> bool:
-        """Whether a pose passes the gate if the clock offset is taken for unknown."""
+        """Whether a pose can be used, and passes the gate if the clock offset is taken for unknown."""
         innovation = self._history.compared(pose)
-        return innovation is not None and is_of_unknown_clock(self._config, innovation)
+        return innovation is not None and is_of_unknown_clock(self._config, innovation) and not self._unusable(pose)
 
     def move_map(self, T_new_old: FloatArray) -> None:
         """Follow a correction of the map: T_new = T_new_old @ T_old. Of an initialisation, poses in the old map go."""

@@ -11,7 +11,7 @@ from support.flights import config, errors, Flight, in_order, run_watched, START
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.geometry.se3 import so3_log
+from thermal_fiducial.core.geometry.se3 import so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 
 AT = 2.5
@@ -20,13 +20,22 @@ LATE = 0.03
 FOLLOWED = AT + 1.0
 
 
-def flown(step=0.0, late=LATE, pose_rate=30.0):
-    """The filter, its states, and the flight, in which the stamps step ahead, or poses are late, from ``AT`` on."""
+#: When one pose is wrong, and its error [m].
+WRONG_AT, WRONG_BY = 4.0, 0.3
+
+
+def flown(step=0.0, late=LATE, pose_rate=30.0, wrong=False):
+    """The filter, its states, and the flight, in which the stamps step ahead, or poses are late, from ``AT`` on.
+
+    ``wrong``: whether one pose is, later.
+    """
     flight = Flight(seed=3, seconds=5.0, pose_rate=pose_rate)
     arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
     for pose in flight.poses:
         later = pose.stamp_ns - START_NS >= AT * 1e9
         arrives = pose.stamp_ns + round(1e9 * (late if later else LATE))
+        if wrong and abs(pose.stamp_ns - START_NS - WRONG_AT * 1e9) < 0.5e9 / pose_rate:
+            pose = replace(pose, T_map_camera=transform(np.eye(3), [WRONG_BY, 0.0, 0.0]) @ pose.T_map_camera)
         arrivals.append((arrives, 1, replace(pose, stamp_ns=pose.stamp_ns + round(1e9 * step * later))))
     ekf = PoseEkf(config())
     states, lost = run_watched(ekf, in_order(arrivals))
@@ -53,6 +62,54 @@ def test_late_poses_are_no_step(late):
     # Beyond ``max_delay`` they are refused, and the filter coasts for two and a half seconds.
     assert off.max() < (0.05 if late < 1.0 else 0.5)
     assert abs(ekf.camera_time_offset or 0.0) < 0.02
+
+
+@pytest.mark.parametrize('late', [0.08, 0.13, 0.23])
+def test_a_wrong_pose_is_no_step_although_all_are_later_than_they_were(late):
+    """A detector that has become slower for good: the present poses fit as they come."""
+    ekf, states, lost, flight = flown(late=late, wrong=True)
+    off, _ = errors(flight, states, FOLLOWED)
+    assert off.max() < 0.05
+    assert not lost[-len(off) :].any()
+    assert ekf.resets == 0
+    assert ekf.diagnostics()['poses refused'] == 1.0
+    assert abs(ekf.camera_time_offset or 0.0) < 0.02
+
+
+@pytest.mark.parametrize('begins', [-2.0, 0.5, 2.0])
+def test_a_clock_that_is_set_soon_after_the_start_is_not_set_back_by_a_wrong_pose(begins):
+    """By NTP or PTP, before it is known what delay is usual: a step back could not be used."""
+    flight = Flight(seed=1, seconds=10.0)
+    arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
+    for k, pose in enumerate(flight.poses):
+        arrives = pose.stamp_ns + round(1e9 * LATE)
+        if arrives - START_NS < 1.5e9:
+            pose = replace(pose, stamp_ns=pose.stamp_ns + round(1e9 * begins))
+        if k == 200:
+            pose = replace(pose, T_map_camera=transform(np.eye(3), [WRONG_BY, 0.0, 0.0]) @ pose.T_map_camera)
+        arrivals.append((arrives, 1, pose))
+    ekf = PoseEkf(config())
+    states, lost = run_watched(ekf, in_order(arrivals))
+    off, _ = errors(flight, states, 4.0)
+    assert off.max() < 0.05
+    assert not lost[-len(off) :].any()
+
+
+def test_a_verdict_has_the_stamp_that_came():
+    """After a step too: the detector takes the clock offset from both stamps of ``camera_clock``."""
+    flight, step_ns = Flight(seed=3, seconds=5.0), 300_000_000
+    ekf = PoseEkf(config())
+    arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
+    for pose in flight.poses:
+        later = pose.stamp_ns - START_NS >= AT * 1e9
+        stamped = replace(pose, stamp_ns=pose.stamp_ns + step_ns * later)
+        arrivals.append((pose.stamp_ns + round(1e9 * LATE), 1, stamped))
+    for arrival in in_order(arrivals):
+        if isinstance(arrival, ImuSample):
+            ekf.add_imu(arrival)
+        else:
+            assert ekf.add_pose(arrival).stamp_ns == arrival.stamp_ns
+    assert ekf.camera_time_offset == pytest.approx(-0.3, abs=0.01)
 
 
 def test_poses_that_come_while_the_imu_is_silent_say_nothing_of_the_usual_delay():
