@@ -131,6 +131,9 @@ class ImuInput:
     def _stray(self, stamp_ns: int) -> Verdict:
         assert self._last_ns is not None
         run = self._strays
+        if run is not None and run.first_ns <= stamp_ns <= run.last_ns:
+            # Messages that come twice, or in another order, end no run.
+            return Verdict.REPEATED if stamp_ns == run.last_ns else Verdict.BACKWARD
         if run is None or not 0 < stamp_ns - run.last_ns <= self._max_gap_ns:
             run = self._strays = StrayRun(stamp_ns, stamp_ns)
         else:

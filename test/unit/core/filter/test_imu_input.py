@@ -129,3 +129,24 @@ def test_a_gap_soon_after_another_stray_is_a_gap(imu, noise, first, later_ms, be
     assert found[:102] == [Verdict.USE] * 100 + lost
     assert set(found[102 : 102 + len(between)]) == {Verdict.USE}
     assert found[102 + len(between) :] == [Verdict.AHEAD] * 2 + [Verdict.USE] * 18
+
+
+@pytest.mark.parametrize('jump_ns', [60_000_000, 3_600_000_000_000])
+def test_samples_that_come_twice_end_a_gap_and_a_jump_of_the_clock(imu, noise, jump_ns):
+    before = [STEP_NS * k for k in range(100)]
+    after = [before[-1] + jump_ns + STEP_NS * k for k in range(20)]
+    once = stamped(imu, noise, before + after)
+    twice = stamped(ImuInput(0.5, 10.0, 100.0), noise, [ns for ns in before + after for _ in range(2)])
+    assert twice[::2] == once
+    assert set(twice[1::2]) == {Verdict.REPEATED}
+
+
+def test_samples_in_swapped_pairs_end_a_gap(imu, noise):
+    before = [STEP_NS * k for k in range(100)]
+    pairs = [(k + 1, k) for k in range(0, 40, 2)]
+    after = [before[-1] + 60_000_000 + STEP_NS * k for pair in pairs for k in pair]
+    found = stamped(imu, noise, before + after)[100:]
+    # The newer one of each pair is used once three samples continue from one another; the older ones are late, but for
+    # the very first, with which the run begins anew.
+    assert found[::2] == [Verdict.AHEAD] * 2 + [Verdict.USE] * 18
+    assert found[1::2] == [Verdict.AHEAD] + [Verdict.BACKWARD] * 19
