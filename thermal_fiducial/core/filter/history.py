@@ -70,10 +70,11 @@ class History:
         if estimate.stamp_ns >= until_ns:
             return hypothesis
         for begin_ns, std in self._imu_steps:
-            if estimate.stamp_ns <= begin_ns < until_ns:
-                before = self._carried(hypothesis, begin_ns).estimate
-                estimate = before.after_imu_step(self.imu.at(begin_ns), std)
-                hypothesis = hypothesis._replace(estimate=estimate)
+            if not estimate.stamp_ns <= begin_ns < until_ns:
+                continue
+            if begin_ns > estimate.stamp_ns:
+                estimate = propagated(estimate, self.imu.steps(estimate.stamp_ns, begin_ns), begin_ns, self.walks)
+            estimate = estimate.after_imu_step(self.imu.at(begin_ns), std)
         steps = self.imu.steps(estimate.stamp_ns, until_ns)
         return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self.walks))
 
@@ -137,6 +138,9 @@ class History:
         """Remove the beliefs after poses of ``stamp_ns`` and later."""
         while len(self._beliefs) > 1 and self.belief.verdict.stamp_ns >= stamp_ns:
             self._forget_belief()
+        if not self.belief.hypotheses:
+            # Another pose begins the initialisation.
+            self._beliefs[-1] = self.belief._replace(first_offset=0.0)
 
     def _forget_belief(self) -> None:
         del self._beliefs[-1]
