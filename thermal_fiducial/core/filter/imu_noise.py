@@ -32,6 +32,8 @@ _GAP = GAP_NS / SECOND_NS
 _BANDS, _LOWEST, _HIGHEST = 4, 12.5, 50.0
 #: Length of a window [s], number of windows that overlap at any time, windows in the running mean.
 _WINDOW, _OVERLAPPING, _MEAN_OF = 0.32, 4, 12
+#: Change of the mean step beyond which samples come at another rate: bursts and lost samples change it by less.
+_OTHER_RATE = 1.3
 
 
 class ImuNoiseMonitor:
@@ -154,7 +156,9 @@ class NoiseFloor:
 
     def __init__(self) -> None:
         self._samples: list[FloatArray] = []
-        self._seconds = 0.0
+        #: of each of them the time since the one before, and the mean that the window is for [s]
+        self._seconds: list[float] = []
+        self._step = 0.0
         self._window = self._bands = np.zeros((0, 1))
         self._power = np.zeros((1, 2))
         self._windows = 0
@@ -164,21 +168,33 @@ class NoiseFloor:
     def add(self, imu: FloatArray, seconds: float) -> None:
         """Add a sample (6,) that follows the last one after ``seconds``; one behind a gap begins a new window."""
         if seconds > _GAP:
-            self._samples.clear()
-            self._seconds = 0.0
+            self._begin()
         self._samples.append(imu)
+        self._seconds.append(seconds)
         differences = len(self._samples) - 2
-        if not len(self._window) and differences > 0:
-            self._seconds += seconds
-            if self._seconds >= _WINDOW:
-                self._prepare(differences)
+        if not len(self._window) and sum(self._seconds[2:]) >= _WINDOW:
+            self._prepare(differences)
         if 0 < len(self._window) <= differences:
+            self._measure_or_begin(differences)
+
+    def _measure_or_begin(self, differences: int) -> None:
+        """Measure a full window; where the rate has changed, begin with one for the new rate."""
+        change = sum(self._seconds[2:]) / differences / self._step
+        if 1.0 / _OTHER_RATE < change < _OTHER_RATE:
             self._measure()
-            del self._samples[: max(differences // _OVERLAPPING, 1)]
+            old = max(differences // _OVERLAPPING, 1)
+            del self._samples[:old], self._seconds[:old]
+        else:
+            self._window = self._window[:0]
+            self._begin()
+
+    def _begin(self) -> None:
+        self._samples.clear()
+        self._seconds.clear()
 
     def _prepare(self, count: int) -> None:
         """Window of ``count`` differences and bands, for the rate that the samples turn out to have."""
-        seconds = self._seconds / count
+        self._step = seconds = sum(self._seconds[2:]) / count
         frequencies = np.fft.rfftfreq(count, seconds)
         edges = np.linspace(_LOWEST, min(_HIGHEST, 0.5 / seconds), _BANDS + 1)
         inside = (frequencies >= edges[:-1, None]) & (frequencies < edges[1:, None])
@@ -187,6 +203,7 @@ class NoiseFloor:
         # Power of second differences to squared density of the samples.
         gain = 4.0 * np.sin(np.pi * frequencies * seconds) ** 2
         scale = seconds / (np.maximum(gain, TINY) ** 2 * (self._window**2).sum())
+        self._windows = 0
         self._bands = inside / inside.sum(axis=1, keepdims=True) * scale
 
     def _measure(self) -> None:

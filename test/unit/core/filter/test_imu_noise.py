@@ -43,6 +43,16 @@ def test_the_floor_of_the_noise_is_found_under_motion_and_between_tones(rate):
     assert noise == pytest.approx((1.0e-3, 2.0e-2), rel=0.3)
 
 
+@pytest.mark.parametrize('rates', [(50.0, 200.0), (200.0, 50.0), (400.0, 100.0)])
+def test_the_floor_is_found_after_a_change_of_the_rate(rates):
+    """An autopilot is asked for another rate once it streams."""
+    monitor = ImuNoiseMonitor(LINEAR)
+    for seed, rate in enumerate(rates):
+        noise = last(monitor, white(round(6.0 * rate), rate, seed=seed), 1.0 / rate)
+    # As above, less what is not there; at 50 Hz a band has a third of the values.
+    assert noise == pytest.approx((1.0e-3, 2.0e-2), rel=0.3)
+
+
 def test_motion_makes_errors_in_proportion():
     t = np.arange(800) / 200.0
     swings = GRAVITY + np.outer(np.sin(2.0 * np.pi * t), [2.0, 0.0, 0.0, 3.0, 0.0, 0.0])
