@@ -166,7 +166,7 @@ class RestartHint:
 
     def contradiction(self, pose: CameraPose) -> float:
         """Distance [m] of an implausibly far pose from the last one; 0 if the pose is plausible."""
-        seconds = (pose.stamp_ns - self._last.stamp_ns) / SECOND_NS
+        seconds = (pose.stamp_ns - self._last.stamp_ns) / SECOND_NS + (self._last.camera_time_offset or 0.0)
         if not 0.0 <= seconds <= HINT_SECONDS or self._dropped:
             return 0.0
         position = (pose.T_map_camera @ self._T_camera_body)[:3, 3]

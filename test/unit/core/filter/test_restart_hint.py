@@ -10,12 +10,15 @@ from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import CameraPose
 
 SECOND = 1_000_000_000
-LAST = LastPose(5 * SECOND, transform(so3_exp([0.0, 0.0, 0.3]), [1.0, 2.0, 3.0]), 0.004)
+#: t_imu - t_camera [s]
+OFFSET = 0.004
+LAST = LastPose(5 * SECOND, transform(so3_exp([0.0, 0.0, 0.3]), [1.0, 2.0, 3.0]), OFFSET)
 
 
 def camera_pose(seconds, x):
     """A camera at x along the first axis from the map's origin, ``seconds`` after the last pose."""
-    return CameraPose(LAST.stamp_ns + round(seconds * SECOND), transform(np.eye(3), [x, 2.0, 3.0]), np.eye(6))
+    stamp_ns = LAST.stamp_ns + round((seconds - OFFSET) * SECOND)
+    return CameraPose(stamp_ns, transform(np.eye(3), [x, 2.0, 3.0]), np.eye(6))
 
 
 @pytest.fixture
