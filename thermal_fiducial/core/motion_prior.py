@@ -18,13 +18,15 @@ import numpy as np
 from thermal_fiducial.core.error_model import of_single_error, positive
 from thermal_fiducial.core.geometry.reprojection import lever_arm, turned
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
-from thermal_fiducial.core.measurements import CameraPose, LATEST_NS, Odometry
+from thermal_fiducial.core.measurements import CameraPose, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Fastest component of a twist [m/s, rad/s]: no camera that sees markers moves like this, a filter that diverges does.
 FASTEST = 50.0
 #: Longest time [s] over which the mapper extrapolates an odometry state to a frame.
 MAX_AGE = 0.3
+# A stamp farther back [ns] is not of a message that was overtaken: the clock was set, and all before is of another one.
+_REORDERED_NS = 100_000_000
 # Largest delay of frames, for which states are kept [ns].
 _KEPT_NS = 500_000_000
 # Largest number of states: two seconds of odometry at 1 kHz.
@@ -68,7 +70,7 @@ class MotionPrior:
 
     def add(self, stamp_ns: int, state: Any) -> None:
         """Keep the state of a stamp, decoded or not."""
-        if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - LATEST_NS:
+        if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - _REORDERED_NS:
             self._stamps_ns, self._states = [], []
         place = bisect_left(self._stamps_ns, stamp_ns)
         if place < len(self._stamps_ns) and self._stamps_ns[place] == stamp_ns:

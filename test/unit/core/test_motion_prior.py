@@ -80,6 +80,13 @@ def test_old_states_are_forgotten_and_a_clock_set_back_begins_anew():
     assert stamps(log.between(-1, 10**12, 10**6)) == [0]
 
 
+def test_a_clock_that_is_set_back_by_a_part_of_a_second_leaves_nothing_of_before():
+    log = motion_prior(*states(1000))
+    newest_ns = log.between(0, 10**12, 10**6)[-1].stamp_ns
+    log.add(newest_ns - 200_000_000, STATE)
+    assert len(log.between(0, 10**12, 10**6)) == 1
+
+
 def test_stamps_that_do_not_go_on_fill_no_memory():
     log = MotionPrior()
     for k in range(10_000):

@@ -8,7 +8,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
-from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2, TimeReference
+from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support import small_bag
@@ -330,10 +330,6 @@ HOSTILE_MAPS = {
 }
 
 
-def far_clock():
-    return TimeReference(header=at(START), time_ref=at(1).stamp, source='camera')
-
-
 def test_everything_hostile_and_then_a_good_flight(graph, tmp_path):
     """All that is above on the topics of three running nodes; the flight after it is located as well as ever."""
     map_file = small_bag.side_files(tmp_path, ids=(0, 1, 2, 3))[0]
@@ -346,7 +342,6 @@ def test_everything_hostile_and_then_a_good_flight(graph, tmp_path):
         ('odometry', [odometry(state(START, **values)) for values in HOSTILE_STATES.values()]),
         ('thermal/image', list(HOSTILE_IMAGES.values())),
         ('markers', list(HOSTILE_MARKERS.values())),
-        ('camera_clock', [far_clock()]),
         *((topic, [message()]) for topic, message in FOR_FILTER),
     ):
         graph.send(topic, *messages)

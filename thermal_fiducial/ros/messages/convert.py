@@ -38,8 +38,6 @@ if TYPE_CHECKING:
 
 #: Largest deviation of a quaternion's norm from 1.
 NORM_TOLERANCE = 0.1
-# Largest offset of two clocks of one robot [s].
-_LARGEST_CLOCK_OFFSET = 10.0
 # --- stamps, headers, poses ---------------------------------------------------------------------------
 
 
@@ -47,20 +45,6 @@ def clock_reference(camera_stamp_ns: int, offset: float) -> TimeReference:
     """The instant of a frame in both clocks, for t_imu = t_camera + ``offset`` [s]."""
     imu_stamp_ns = camera_stamp_ns + round(offset * SECOND_NS)
     return TimeReference(header=header(imu_stamp_ns, ''), time_ref=header(camera_stamp_ns, '').stamp, source='camera')
-
-
-def checked_clock_offset(imu_stamp_ns: int, camera_stamp_ns: int) -> float:
-    """Clock offset [s] of a :func:`clock_reference`.
-
-    Raises
-    ------
-    InputError
-        An offset larger than any that the filter estimates.
-    """
-    offset = (imu_stamp_ns - camera_stamp_ns) / SECOND_NS
-    if abs(offset) > _LARGEST_CLOCK_OFFSET:
-        raise InputError(f'camera_clock that is {offset:.6g} s off')
-    return offset
 
 
 def header(stamp: int, frame_id: str) -> Header:

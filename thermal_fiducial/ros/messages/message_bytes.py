@@ -165,7 +165,7 @@ def clock_offset(message: bytes) -> float:
     Raises
     ------
     InputError
-        As :func:`thermal_fiducial.ros.messages.convert.checked_clock_offset`, or an unknown encoding.
+        Cut short, or no stamp.
     """
     what = 'camera_clock'
     imu_stamp_ns = stamp_ns(message, what)
@@ -173,7 +173,7 @@ def clock_offset(message: bytes) -> float:
         camera_stamp = _STAMP.unpack_from(message, _aligned(_behind_names(message, 1), _LENGTH.size))
     except struct.error:
         raise InputError(f'{what} of {len(message)} bytes is cut short') from None
-    return convert.checked_clock_offset(imu_stamp_ns, convert.checked_stamp(*camera_stamp))
+    return (imu_stamp_ns - convert.checked_stamp(*camera_stamp)) / SECOND_NS
 
 
 def frame_id(message: bytes) -> str:
