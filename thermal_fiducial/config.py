@@ -687,10 +687,11 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
     time_offset_random_walk: float = _clock_random_walk(('estimate_time_offset',))
     stamp_jitter: float = param(
         0.005,
-        'Initial standard deviation of the jitter of the camera stamps, estimated from the poses. 0: no jitter.',
+        'Initial standard deviation of the jitter of the camera stamps, estimated from the poses, 0.1 to 20 ms. '
+        '0: no jitter.',
         unit='s',
         minimum=0.0,
-        maximum=0.05,
+        maximum=0.02,
     )
     mount_vibration: float = param(
         5.0e-4,
