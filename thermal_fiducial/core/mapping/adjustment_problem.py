@@ -1,16 +1,16 @@
 """The bundle adjustment as arrays: its input, and residuals, Jacobians and normal equations of all views."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from thermal_fiducial.config import CHI2_OF_POSE
 from thermal_fiducial.core.error_model import CHI2_OF_VIEW, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, linearise, retract, whitening
 from thermal_fiducial.core.geometry.rigid_fit import robust
-from thermal_fiducial.core.mapping.map_data import gauge, MapMarker
+from thermal_fiducial.core.mapping.map_data import exact, gauge, MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
@@ -25,10 +25,18 @@ class Priors:
     T: FloatArray
     information: FloatArray
 
+    def moved(self, T_new_old: FloatArray) -> 'Priors':
+        """Those of a frame that lies at ``T_new_old`` (4, 4), a small transform."""
+        return Priors(T_new_old @ self.T, self.information)
+
     def apart(self, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Differences (k, 6) from poses (k, 4, 4) to their priors, and chi squares (k,) of these."""
         d = difference(self.T, T)
         return d, np.einsum('ki,kij,kj->k', d, self.information, d)
+
+    def weighted(self, chi2: FloatArray) -> FloatArray:
+        """Information (k, 6, 6) with robust weights, by chi squares (k,) of :meth:`apart`."""
+        return np.asarray(self.information * robust(chi2, CHI2_OF_POSE)[1][:, None, None])
 
 
 @dataclass(frozen=True)
@@ -70,7 +78,7 @@ class Snapshot:
         has_odometry: BoolArray = np.asarray(self.odometry.information.any(axis=(1, 2)))
         useful = of_map & ((number >= 2) | has_odometry)[self.frame]
         seen = np.unique(self.ids[useful])
-        held = gauge([self.markers[key] for key in seen.tolist()])
+        held = self.held(seen)
         reached = np.isin(self.ids, [*seen[held], *self.known]) | has_odometry[self.frame]
         while True:
             joined = useful & np.isin(self.frame, self.frame[useful & reached])
@@ -79,13 +87,32 @@ class Snapshot:
                 return np.asarray(joined)
             reached = more
 
+    def held(self, ids: IntArray) -> BoolArray:
+        """Which of the markers ``ids`` (M,) are held: exact ones; failing these and priors, the one known best.
+
+        Where all are known by priors alone, none is better than all together: to hold one would turn the map by what
+        that one is turned by.
+        """
+        markers = [self.markers[key] for key in ids.tolist()]
+        held = exact(markers)
+        return held if held.any() or np.isin(ids, list(self.known)).any() else gauge(markers)
+
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of all keyframes (F, 4, 4) and markers (M, 4, 4)."""
+    """Poses of all keyframes (F, 4, 4) and markers (M, 4, 4), and of the frame of the odometry (4, 4)."""
 
     T_map_camera: FloatArray
     T_map_marker: FloatArray
+    T_map_odometry: FloatArray = field(default_factory=lambda: np.eye(4))
+
+    def moved(self, frames: FloatArray, nodes: FloatArray) -> 'Poses':
+        """By steps (F, 6) of the keyframes, and (M + 1, 6) of the markers and, last, the odometry."""
+        return Poses(
+            retract(self.T_map_camera, frames),
+            retract(self.T_map_marker, nodes[:-1]),
+            retract(self.T_map_odometry, nodes[-1]),
+        )
 
 
 @dataclass(frozen=True)
@@ -114,9 +141,8 @@ class Linearised:
 
     def cost(self, scale: float) -> float:
         """Robust sum of squares."""
-        of_views = np.sum(self.view_costs(scale))
-        of_cameras = np.sum(robust(self.camera_chi2, CHI2_OF_POSE)[0])
-        return float(of_views + of_cameras + np.sum(self.marker_chi2))
+        of_priors = robust(np.concatenate([self.camera_chi2, self.marker_chi2]), CHI2_OF_POSE)[0]
+        return float(np.sum(self.view_costs(scale)) + np.sum(of_priors))
 
 
 @dataclass(frozen=True)
@@ -127,7 +153,9 @@ class MapProblem:
     ids: list[int]
     stamps: list[int]
     sizes: FloatArray
+    #: (M,) markers that never move, and those that carry the scale
     held: BoolArray
+    anchors: BoolArray
     cameras: tuple[Camera, ...]
     frame: IntArray
     marker: IntArray
@@ -144,7 +172,7 @@ class MapProblem:
         seen, marker = np.unique(snapshot.ids[views], return_inverse=True)
         frames, frame = np.unique(snapshot.frame[views], return_inverse=True)
         markers = [snapshot.markers[key] for key in seen.tolist()]
-        held = gauge(markers)
+        held = snapshot.held(seen)
         if np.all(held):
             return None
         T_map_marker = np.stack([m.T_map_marker for m in markers])
@@ -154,6 +182,7 @@ class MapProblem:
             stamps=snapshot.stamps_ns[frames].tolist(),
             sizes=np.array([m.size for m in markers]),
             held=held,
+            anchors=gauge(markers),
             cameras=snapshot.cameras,
             frame=frame,
             marker=marker,
@@ -182,7 +211,8 @@ class MapProblem:
         chi2 = np.where(behind, _BEHIND_CHI2, np.sum(r * r, axis=-1))
         J_camera, J_marker = ((self.W @ J.reshape(n, 4, 2, 6)).reshape(n, 8, 6) for J in (J_camera, J_marker))
         squared_px = np.sum(residuals**2, axis=(1, 2))
-        of_cameras, of_markers = self.odometry.apart(state.T_map_camera), self.known.apart(state.T_map_marker)
+        of_cameras = self.odometry.moved(state.T_map_odometry).apart(state.T_map_camera)
+        of_markers = self.known.apart(state.T_map_marker)
         return Linearised(state, r, J_camera, J_marker, chi2, squared_px, *of_cameras, *of_markers)
 
     def step(self, now: Linearised, scale: float, damping: float) -> Linearised | None:
@@ -191,10 +221,10 @@ class MapProblem:
         system = self.equations.reduced(blocks, damping)
         if system is None:
             return None
-        frames, markers = (steps[..., 0] for steps in system.solve(*sides))
-        if not (np.all(np.isfinite(frames)) and np.all(np.isfinite(markers))):
+        frames, nodes = (steps[..., 0] for steps in system.solve(*sides))
+        if not (np.all(np.isfinite(frames)) and np.all(np.isfinite(nodes))):
             return None
-        return self.evaluate(Poses(retract(now.state.T_map_camera, frames), retract(now.state.T_map_marker, markers)))
+        return self.evaluate(now.state.moved(frames, nodes))
 
     def mirrored(self, state: Poses) -> Poses:
         """The state with each marker in about the other pose that its views allow: turned by 180 deg about them."""
@@ -204,36 +234,59 @@ class MapProblem:
         about_sight = 2.0 * mean[:, :, None] * mean[:, None, :] - np.eye(3)
         T_map_marker = state.T_map_marker.copy()
         T_map_marker[:, :3, :3] = about_sight @ T_map_marker[:, :3, :3] @ np.diag([-1.0, -1.0, 1.0])
-        return Poses(state.T_map_camera, T_map_marker)
+        return replace(state, T_map_marker=T_map_marker)
 
     def markers_stepped(self, now: Linearised, scale: float) -> Poses:
         """After one Gauss-Newton step of each marker alone."""
         blocks, _, side = self.normal(now, scale)
-        largest = np.max(blocks.marker, axis=(1, 2), keepdims=True)
-        steps = np.linalg.solve(blocks.marker + (TINY * largest + TINY) * np.eye(6), side)
-        return Poses(now.state.T_map_camera, retract(now.state.T_map_marker, steps[..., 0]))
+        largest = np.max(blocks.node, axis=(1, 2), keepdims=True)
+        steps = np.linalg.solve(blocks.node + (TINY * largest + TINY) * np.eye(6), side)
+        return replace(now.state, T_map_marker=retract(now.state.T_map_marker, steps[:-1, :, 0]))
 
     @property
     def equations(self) -> NormalEquations:
-        """Which view connects what."""
-        return NormalEquations(self.frame, self.marker, self.held)
+        """Which keyframe is connected with which node: with markers by views, and with the frame of the odometry.
+
+        Where a marker is held, the filter's map is taken to be this one. Where none is, poses of the filter know no
+        better where the map lies than the priors that they come from: its odometry is of motion alone.
+        """
+        keyframes = np.arange(len(self.stamps))
+        frame = np.concatenate([self.frame, keyframes])
+        node = np.concatenate([self.marker, np.full(len(keyframes), len(self.ids))])
+        return NormalEquations(frame, node, np.append(self.held, self.held.any()))
 
     def normal(self, now: Linearised, scale: float) -> tuple[Blocks, FloatArray, FloatArray]:
-        """Normal equations, and their right sides (F, 6, 1) and (M, 6, 1)."""
+        """Normal equations, and their right sides (F, 6, 1) and (M + 1, 6, 1)."""
         weights = now.weights(scale)[:, None, None]
         of_camera, of_marker = (weights * np.swapaxes(J, -1, -2) for J in (now.J_camera, now.J_marker))
-        r = now.r[..., None]
-        odometry = self.odometry.information * robust(now.camera_chi2, CHI2_OF_POSE)[1][:, None, None]
+        odometry, known = self.odometry.weighted(now.camera_chi2), self.known.weighted(now.marker_chi2)
+        of_camera_by_odometry = odometry @ self._by_odometry(now)
+        of_odometry = np.swapaxes(self._by_odometry(now), -1, -2) @ of_camera_by_odometry
         blocks = Blocks(
             frame=self.over_frames(of_camera @ now.J_camera) + odometry,
-            marker=self.over_markers(of_marker @ now.J_marker) + self.known.information,
-            cross=of_camera @ now.J_marker,
+            node=_with_odometry(self.over_markers(of_marker @ now.J_marker) + known, of_odometry),
+            cross=np.concatenate([of_camera @ now.J_marker, -of_camera_by_odometry]),
         )
-        return (
-            blocks,
-            self.over_frames(of_camera @ r) + odometry @ now.camera_apart[..., None],
-            self.over_markers(of_marker @ r) + self.known.information @ now.marker_apart[..., None],
-        )
+        of_priors = odometry @ now.camera_apart[..., None], known @ now.marker_apart[..., None]
+        return blocks, *self.sides(now, weights * now.r[..., None], *of_priors)
+
+    def sides(
+        self, now: Linearised, of_views: FloatArray, of_odometry: FloatArray, of_known: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Right sides (F, 6, k) and (M + 1, 6, k) of the normal equations.
+
+        Parameters
+        ----------
+        of_views : (n, 8, k) weighted residuals
+        of_odometry, of_known : (F, 6, k), (M, 6, k) information times differences from the priors
+        """
+        of_frames, of_markers = (np.swapaxes(J, -1, -2) @ of_views for J in (now.J_camera, now.J_marker))
+        back = -np.swapaxes(self._by_odometry(now), -1, -2) @ of_odometry
+        return self.over_frames(of_frames) + of_odometry, _with_odometry(self.over_markers(of_markers) + of_known, back)
+
+    def _by_odometry(self, now: Linearised) -> FloatArray:
+        """Derivatives (F, 6, 6) of the keyframes' poses by odometry by the pose of its frame."""
+        return lever_arm(self.odometry.T[:, :3, 3] @ now.state.T_map_odometry[:3, :3].T)
 
     def over_frames(self, values: FloatArray) -> FloatArray:
         """Sums (F, ...) of values (n, ...) of the views over those of each keyframe."""
@@ -244,6 +297,11 @@ class MapProblem:
         order = np.argsort(self.marker, kind='stable')
         starts = np.flatnonzero(np.diff(self.marker[order], prepend=-1))
         return np.asarray(np.add.reduceat(values[order], starts, axis=0))
+
+
+def _with_odometry(of_markers: FloatArray, of_frames: FloatArray) -> FloatArray:
+    """Those of M markers (M, ...), and last the sum over the keyframes (F, ...): (M + 1, ...)."""
+    return np.concatenate([of_markers, np.sum(of_frames, axis=0, keepdims=True)])
 
 
 def _known(snapshot: Snapshot, ids: IntArray, T_map_marker: FloatArray) -> Priors:

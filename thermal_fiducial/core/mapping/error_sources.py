@@ -23,7 +23,7 @@ from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProb
 from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
 from thermal_fiducial.core.types import FloatArray
 
-#: Right sides (F, 6, k) and (M, 6, k) of the normal equations.
+#: Right sides (F, 6, k) and (M + 1, 6, k) of the normal equations.
 Sides = tuple[FloatArray, FloatArray]
 #: Draws that are propagated at a time, which bounds the memory.
 _AT_ONCE = 32
@@ -48,23 +48,23 @@ class ErrorSources:
         widened : factor of the variances of corners and priors
         known : (M, 6, K) draws of the held markers; others are not used
         """
-        lasting, of_held = self._lasting(errors), self.system.by_held(known)
+        of_odometry = np.zeros_like(known[:1])
+        lasting, of_held = self._lasting(errors), self.system.by_held(np.concatenate([known, of_odometry]))[:-1]
         positions = self.now.state.T_map_marker[:, :3, 3]
-        covariances = widened * self.system.covariances() + covariance_of(lasting) + covariance_of(of_held)
-        covariances += scale_of_map(arms_of_scale(positions, positions[self.problem.held]), errors)
+        covariances = widened * self.system.covariances()[:-1] + covariance_of(lasting) + covariance_of(of_held)
+        covariances += scale_of_map(arms_of_scale(positions, positions[self.problem.anchors]), errors)
         return covariances, lasting + self._noise(widened) + of_held
 
     def _noise(self, widened: float) -> FloatArray:
         """(M, 6, K) by noise of corners and priors."""
         problem, roots = self.problem, np.sqrt(widened * self.weights)[:, None, None]
-        of_frame, of_marker = (
-            np.sqrt(widened) * root_of(priors.information) for priors in (problem.odometry, problem.known)
-        )
+        of_frame = np.sqrt(widened) * root_of(problem.odometry.weighted(self.now.camera_chi2))
+        of_marker = np.sqrt(widened) * root_of(problem.known.weighted(self.now.marker_chi2))
 
         def sides(_: slice) -> Sides:
-            of_frames, of_markers = self._of_residuals(roots * self._normal(len(roots), 8))
-            of_frames += of_frame @ self._normal(len(of_frame), 6)
-            return of_frames, of_markers + of_marker @ self._normal(len(of_marker), 6)
+            of_views = roots * self._normal(len(roots), 8)
+            of_odometry = of_frame @ self._normal(len(of_frame), 6)
+            return problem.sides(self.now, of_views, of_odometry, of_marker @ self._normal(len(of_marker), 6))
 
         return self._solved(sides)
 
@@ -81,27 +81,24 @@ class ErrorSources:
             LensErrors(problem.corners[own], camera, errors) for own, camera in zip(views, problem.cameras, strict=True)
         ]
 
+        no_priors = [np.zeros((number, 6, _AT_ONCE)) for number in (len(problem.stamps), len(problem.ids))]
+
         def sides(chosen: slice) -> Sides:
             off = (shapes * self._normal(len(shapes), 4, 2))[problem.marker]
             for own, lens in zip(views, lenses, strict=True):
                 off[own] += lens.drawn(chosen)
-            return self._of_residuals(weights * (problem.W @ off).reshape(-1, 8, _AT_ONCE))
+            of_views = weights * (problem.W @ off).reshape(-1, 8, _AT_ONCE)
+            return problem.sides(self.now, of_views, *no_priors)
 
         return self._solved(sides)
 
     def _solved(self, sides: Callable[[slice], Sides]) -> FloatArray:
         """Errors (M, 6, K) by right sides of the normal equations, which come for some of the draws at a time."""
         chosen = (slice(first, first + _AT_ONCE) for first in range(0, DRAWS, _AT_ONCE))
-        return np.concatenate([self.system.solve(*sides(some))[1] for some in chosen], axis=-1)
+        return np.concatenate([self.system.solve(*sides(some))[1][:-1] for some in chosen], axis=-1)
 
     def _normal(self, *shape: int) -> FloatArray:
         return self.rng.standard_normal((*shape, _AT_ONCE))
-
-    def _of_residuals(self, residuals: FloatArray) -> Sides:
-        """Right sides for weighted residuals (n, 8, k)."""
-        problem, now = self.problem, self.now
-        of_frames = problem.over_frames(np.swapaxes(now.J_camera, -1, -2) @ residuals)
-        return of_frames, problem.over_markers(np.swapaxes(now.J_marker, -1, -2) @ residuals)
 
     def _shapes(self, errors: SystematicErrors) -> FloatArray:
         """Standard deviations (M,) [px] of corner errors that are the same in all views of a marker."""

@@ -82,10 +82,12 @@ def snapshot_of(
 def prior_poses(markers: Mapping[int, MapMarker]) -> dict[int, tuple[FloatArray, FloatArray]]:
     """Prior poses and covariances (6, 6) of markers that the map had before the keyframes.
 
-    A map contains the covariance of each marker, without correlations between markers.
+    A map contains the covariance of each marker, without correlations between markers. Those that were surveyed one by
+    one have none.
     """
     known = [m for m in markers.values() if not m.fixed and np.any(m.covariance)]
-    return {m.id: (m.T_map_marker, divided_prior(m.covariance, len(known))) for m in known}
+    related = sum(not m.surveyed for m in known)
+    return {m.id: (m.T_map_marker, m.covariance if m.surveyed else divided_prior(m.covariance, related)) for m in known}
 
 
 @dataclass(frozen=True)

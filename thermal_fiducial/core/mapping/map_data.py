@@ -179,12 +179,17 @@ class MapperResult:
         return tuple(sorted(self.quarantine_reasons))
 
 
+def exact(markers: list[MapMarker]) -> BoolArray:
+    """Which markers are fixed or known exactly."""
+    return np.array([m.fixed or not np.any(m.covariance) for m in markers], dtype=bool)
+
+
 def gauge(markers: list[MapMarker]) -> BoolArray:
-    """Which markers are held: fixed ones and those known exactly; failing these, the one known best."""
-    held = np.array([m.fixed or not np.any(m.covariance) for m in markers], dtype=bool)
-    if markers and not np.any(held):
-        held[int(np.argmin([np.trace(m.covariance) for m in markers]))] = True
-    return held
+    """Those that are exact; failing these, the one known best."""
+    chosen = exact(markers)
+    if markers and not np.any(chosen):
+        chosen[int(np.argmin([np.trace(m.covariance) for m in markers]))] = True
+    return chosen
 
 
 def _fill(rows: np.ndarray, names: Collection[str], values: FloatArray) -> None:

@@ -87,7 +87,7 @@ class MarkerMapper:
         self._consistency = Consistency(self.map.markers)
         #: the last pose that nothing contradicted
         self._last: CameraPose | None = None
-        self._keyframes = KeyframeStore(self.config.keyframe_budget, self._initial)
+        self._keyframes = KeyframeStore(self.config.keyframe_budget, self.map)
 
     def use_map_of(self, owner: 'MarkerMapper') -> None:
         """Locate in the map of ``owner`` as it is now, and change nothing in it, quarantine included."""

@@ -1,4 +1,4 @@
-"""Normal equations of a bundle adjustment over keyframes and markers: Schur complement, solution, covariances."""
+"""Normal equations of a bundle adjustment over keyframes and nodes: Schur complement, solution, covariances."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,34 +18,35 @@ _FULL = 0.15
 
 @dataclass(frozen=True)
 class Blocks:
-    """Gauss-Newton terms of n views of M markers in F keyframes."""
+    """Gauss-Newton terms of n connections of M nodes with F keyframes: of markers by their views, and of odometry."""
 
-    #: (F, 6, 6) and (M, 6, 6) J' J of each keyframe and marker, over its views and its prior
+    #: (F, 6, 6) and (M, 6, 6) J' J of each keyframe and node, over its connections and its prior
     frame: FloatArray
-    marker: FloatArray
-    #: (n, 6, 6) J' J of each view's keyframe with its marker
+    node: FloatArray
+    #: (n, 6, 6) J' J of each connection's keyframe with its node
     cross: FloatArray
 
 
 class NormalEquations:
-    """The structure of the system: which view connects which keyframe with which marker.
+    """The structure of the system: which keyframe is connected with which node.
 
     Parameters
     ----------
-    frame, marker : (n,) of each view; views are ordered by keyframe
-    held : (M,) markers that are held fixed
+    frame, node : (n,) of each connection
+    held : (M,) nodes that are held fixed
     """
 
-    def __init__(self, frame: IntArray, marker: IntArray, held: BoolArray) -> None:
-        self._frame, self._marker, self._held = frame, marker, held
-        self._frames = int(frame[-1]) + 1
-        self._starts = np.searchsorted(frame, np.arange(self._frames + 1))
+    def __init__(self, frame: IntArray, node: IntArray, held: BoolArray) -> None:
+        self._order = np.argsort(frame, kind='stable')
+        self._frame, self._node, self._held = frame[self._order], node[self._order], held
+        self._frames = int(self._frame[-1]) + 1
+        self._starts = np.searchsorted(self._frame, np.arange(self._frames + 1))
 
     def reduced(self, blocks: Blocks, damping: float = 0.0) -> 'ReducedSystem | None':
-        """The system of the markers alone, factorised; None where it is singular."""
+        """The system of the nodes alone, factorised; None where it is singular."""
         try:
             root = np.linalg.inv(np.linalg.cholesky(_damped(blocks.frame, damping)))
-            coupling, matrix = self._schur(root[self._frame] @ blocks.cross, _damped(blocks.marker, damping))
+            coupling, matrix = self._schur(root[self._frame] @ blocks.cross[self._order], _damped(blocks.node, damping))
             free = np.flatnonzero(np.repeat(~self._held, 6))
             factor = _factorised(matrix[free][:, free])
         except (RuntimeError, ValueError, np.linalg.LinAlgError):
@@ -53,59 +54,59 @@ class NormalEquations:
         return ReducedSystem(root, coupling, matrix, factor, self._held)
 
     def _schur(self, cross: FloatArray, own: FloatArray) -> tuple[Any, Any]:
-        """Coupling (6 F, 6 M) of keyframes and markers, and Schur complement (6 M, 6 M); sparse in large maps.
+        """Coupling (6 F, 6 M) of keyframes and nodes, and Schur complement (6 M, 6 M); sparse in large maps.
 
         Parameters
         ----------
-        cross, own : (n, 6, 6), (M, 6, 6) blocks of the views and of the markers
+        cross, own : (n, 6, 6), (M, 6, 6) blocks of the connections, ordered by keyframe, and of the nodes
         """
         frames, each = self._frames, np.arange(len(own))
         if len(cross) > _FULL * frames * len(own):
             cells, blocks = np.zeros((frames, 6, len(own), 6)), np.zeros((len(own), 6, len(own), 6))
-            cells[self._frame, :, self._marker] = cross
+            cells[self._frame, :, self._node] = cross
             blocks[each, :, each] = own
             coupling = cells.reshape(6 * frames, -1)
             return coupling, blocks.reshape(6 * len(own), -1) - coupling.T @ coupling
         # Only here, as its import takes 30 MB.
         from scipy.sparse import bsr_array
 
-        sparse: Any = bsr_array((cross, self._marker, self._starts), shape=(6 * frames, 6 * len(own)))
+        sparse: Any = bsr_array((cross, self._node, self._starts), shape=(6 * frames, 6 * len(own)))
         reduced = bsr_array((own, each, np.arange(len(own) + 1))).tocsr() - sparse.T @ sparse
         return sparse, reduced.toarray() if reduced.shape[0] <= _DENSE else reduced
 
 
 @dataclass(frozen=True)
 class ReducedSystem:
-    """Schur complement: the system of the markers after the keyframes are eliminated."""
+    """Schur complement: the system of the nodes after the keyframes are eliminated."""
 
     #: (F, 6, 6) inverse Cholesky factors of the keyframes' blocks
     root: FloatArray
-    #: (6 F, 6 M) these factors times the cross blocks of keyframes and markers
+    #: (6 F, 6 M) these factors times the cross blocks of keyframes and nodes
     coupling: Any
-    #: (6 M, 6 M) Schur complement, and the factorisation of its part of free markers
+    #: (6 M, 6 M) Schur complement, and the factorisation of its part of free nodes
     matrix: Any
     factor: '_Dense | _Sparse'
     #: (M,)
     held: BoolArray
 
-    def solve(self, of_frames: FloatArray, of_markers: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def solve(self, of_frames: FloatArray, of_nodes: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Solutions (F, 6, K) and (M, 6, K) for right sides of the same shapes."""
         count = of_frames.shape[-1]
         sides = (self.root @ of_frames).reshape(-1, count)
-        remaining = (of_markers.reshape(-1, count) - self.coupling.T @ sides).reshape(of_markers.shape)
-        markers = np.zeros_like(of_markers)
-        markers[~self.held] = self.factor.solve(remaining[~self.held].reshape(-1, count)).reshape(-1, 6, count)
-        left = sides - self.coupling @ markers.reshape(-1, count)
-        return np.swapaxes(self.root, -1, -2) @ left.reshape(of_frames.shape), markers
+        remaining = (of_nodes.reshape(-1, count) - self.coupling.T @ sides).reshape(of_nodes.shape)
+        nodes = np.zeros_like(of_nodes)
+        nodes[~self.held] = self.factor.solve(remaining[~self.held].reshape(-1, count)).reshape(-1, 6, count)
+        left = sides - self.coupling @ nodes.reshape(-1, count)
+        return np.swapaxes(self.root, -1, -2) @ left.reshape(of_frames.shape), nodes
 
     def covariances(self) -> FloatArray:
-        """Covariances (M, 6, 6) of the markers by noise."""
+        """Covariances (M, 6, 6) of the nodes by noise."""
         result = np.zeros((len(self.held), 6, 6))
         result[~self.held] = self.factor.covariances()
         return 0.5 * (result + np.swapaxes(result, -1, -2))
 
     def by_held(self, drawn: FloatArray) -> FloatArray:
-        """Errors (M, 6, K) of all markers by those of the held ones, of ``drawn`` (M, 6, K)."""
+        """Errors (M, 6, K) of all nodes by those of the held ones, of ``drawn`` (M, 6, K)."""
         free, result = ~self.held, np.where(self.held[:, None, None], drawn, 0.0)
         if result.any():
             moved = (self.matrix @ result.reshape(-1, result.shape[-1])).reshape(result.shape)

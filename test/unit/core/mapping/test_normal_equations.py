@@ -87,7 +87,7 @@ def test_damping_adds_to_the_diagonals_of_both():
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize('of', ['frame', 'marker'])
+@pytest.mark.parametrize('of', ['frame', 'node'])
 def test_a_system_that_is_not_positive_definite_has_no_solution(of):
     """A keyframe or a marker with less than no information, as rounding may leave it."""
     equations, blocks, _ = system(7, only(0))
