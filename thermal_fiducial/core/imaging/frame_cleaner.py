@@ -27,8 +27,9 @@ REPEATED_STAMP = 'stamp seen before'
 # Least shift of counts by drivers that fill 16 bits.
 _SHIFTED = 2
 # Share (a power of two) of the range of counts by which neighbours differ at most, and the fewest pairs that show a
-# carry: flags look alike only between a pixel near nought and one near full scale.
-_NEARLY, _FEWEST_CARRIES = 3, 8
+# carry: flags look alike only between a pixel near nought and one near full scale. Frames in a row that show carries
+# which all later ones are taken for such because of: one alone may be garbled.
+_NEARLY, _FEWEST_CARRIES, _FRAMES_WITH_CARRIES = 3, 8, 3
 # Rows of an image; a frame with up to MAX_TELEMETRY_ROWS more carries telemetry.
 STANDARD_HEIGHTS = (1024, 512, 480, 256, 240, 128, 120)
 MAX_TELEMETRY_ROWS = 4
@@ -59,11 +60,13 @@ class FrameCleaner:
         self.config = config
         self._known_bad: IntArray = np.reshape([] if bad_pixels is None else bad_pixels, (-1, 2)).astype(np.int64)
         self._telemetry_on_top = 0
-        #: whether counts use the bits that are masked otherwise: a radiometric camera fills all 16
-        self._counts_beyond = False
+        #: shift of the counts; frames in a row that show carries into the bits that are masked otherwise, as those of a
+        #: radiometric camera, which fills all 16: after a few of them frames without carries are believed too
+        self._shift = self._carrying = 0
         self._restart((0, 0))
 
     def _restart(self, shape: tuple[int, int]) -> None:
+        self._filler = BadPixelFiller(self._known_bad, shape) if shape != (0, 0) else None
         self._shape = shape
         self._stamps: set[int] = set()
         self._newest_ns = 0
@@ -72,7 +75,6 @@ class FrameCleaner:
         self._shutter = ShutterDetector()
         self._finder = BadPixelFinder(shape)
         self._found: IntArray = np.zeros((0, 2), np.int64)
-        self._filler = BadPixelFiller(self._known_bad, shape) if shape != (0, 0) else None
 
     @property
     def repeating(self) -> bool:
@@ -123,18 +125,26 @@ class FrameCleaner:
         image = self._without_telemetry(counts, extra) if extra else counts
         if min(image.shape) < 16:
             raise InputError(f'frame of {image.shape[1]}x{image.shape[0]} pixels is too small')
-        # Some drivers shift counts up; without a shift, noise sets the lowest bits of some pixels.
-        used = int(np.bitwise_or.reduce(image[:: FreezeDetector.ROW_STEP], axis=None))
+        return self._without_flags(image.astype(np.uint16))
+
+    def _without_flags(self, counts: Counts) -> Counts:
+        """Counts without the shift of the driver and without flag bits, in place."""
+        sample, bits = counts[:: FreezeDetector.ROW_STEP], self.config.bits
+        # Some drivers shift counts up; without a shift, noise sets the lowest bits of some pixels. A shift shows where
+        # counts need more bits than they have, and stays.
+        used = int(np.bitwise_or.reduce(sample, axis=None))
         shift = (used & -used).bit_length() - 1
-        down = shift if used >> self.config.bits and shift >= _SHIFTED else 0
-        own = image.astype(np.uint16)
-        if down:
-            own >>= np.uint16(down)
-        elif used >> self.config.bits and not self._counts_beyond:
-            self._counts_beyond = _carries(own[:: FreezeDetector.ROW_STEP], self.config.bits)
-        if not self._counts_beyond:
-            own &= np.uint16((1 << self.config.bits) - 1)
-        return own
+        if shift < _SHIFTED:
+            self._shift = 0
+        elif used >> bits and not self._shift:
+            self._shift = shift
+        if self._shift:
+            counts >>= np.uint16(self._shift)
+        elif used >> bits and self._carrying < _FRAMES_WITH_CARRIES:
+            self._carrying = self._carrying + 1 if _carries(sample, bits) else 0
+        if not self._carrying:
+            counts &= np.uint16((1 << bits) - 1)
+        return counts
 
     def _without_telemetry(self, frame: Counts | Gray, extra: int) -> Counts | Gray:
         """Without ``extra`` rows that carry no image, from the side where the picture breaks off."""

@@ -58,6 +58,16 @@ def test_a_clean_frame_passes_untouched():
     assert not np.shares_memory(result.counts, frame)
 
 
+def test_every_frame_says_that_a_listed_bad_pixel_is_outside():
+    """Of a list for another camera."""
+    camera = Camera(bad_pixels=np.array([[600, 500]]))
+    camera(noisy(scene(), np.random.default_rng(0)))
+    small = noisy(scene(shape=(256, 320)), np.random.default_rng(1))
+    for _ in range(3):
+        with pytest.raises(InputError, match='bad pixel 600 500 lies outside the 320x256 frame'):
+            camera(small)
+
+
 def test_8_bit_frames_become_counts():
     frame = (noisy(scene(), np.random.default_rng(0)) // 64).astype(np.uint8)
     result = Camera()(frame)
@@ -75,13 +85,22 @@ def test_flags_above_14_bits_are_masked():
 
 def test_counts_that_carry_beyond_14_bits_are_no_flags():
     """Kelvin in hundredths: 295 K, and markers of 335 K, beyond 2^15. Masked, these would be the coldest."""
-    counts = noisy(scene(contrast=4000.0), np.random.default_rng(0), 5.0) + np.uint16(22500)
-    assert counts.min() < 1 << 15 < counts.max()
     camera = Camera()
-    assert np.array_equal(camera(counts).counts, counts)
+    for seed in range(3):
+        counts = noisy(scene(contrast=4000.0), np.random.default_rng(seed), 5.0) + np.uint16(22500)
+        assert counts.min() < 1 << 15 < counts.max()
+        assert np.array_equal(camera(counts).counts, counts)
     # and from then on, where none passes a multiple of 2^14
-    cold = noisy(scene(), np.random.default_rng(1)) + np.uint16(22500)
+    cold = noisy(scene(), np.random.default_rng(3)) + np.uint16(22500)
     assert np.array_equal(camera(cold).counts, cold)
+
+
+def test_one_garbled_frame_does_not_end_the_masking_of_flags():
+    camera, rng = Camera(), np.random.default_rng(5)
+    camera(rng.integers(0, 1 << 16, (512, 640)).astype(np.uint16))
+    frame = noisy(scene(), rng)
+    flagged = frame | rng.integers(0, 4, frame.shape).astype(np.uint16) << np.uint16(14)
+    assert np.array_equal(camera(flagged).counts, frame)
 
 
 @pytest.mark.parametrize(('shift', 'largest'), [(2, 1 << 14), (8, 1 << 8)])
@@ -89,6 +108,15 @@ def test_counts_that_a_driver_shifted_up_are_shifted_back(shift, largest):
     """14 bits to fill 16, and 8 bits sent as mono16: masked like flags, the upper ones would wrap."""
     counts = np.random.default_rng(4).integers(0, largest, (512, 640)).astype(np.uint16)
     assert np.array_equal(Camera()(counts << np.uint16(shift)).counts, counts)
+
+
+def test_a_shift_stays_while_nothing_is_hot():
+    """Counts below 4096 fit into 14 bits as they are sent."""
+    camera, rng = Camera(), np.random.default_rng(6)
+    for hot in (1000, 0, 1000, 0):
+        counts = noisy(scene(), rng) - np.uint16(3500)
+        counts[:64] += np.uint16(hot)
+        assert np.array_equal(camera(counts << np.uint16(2)).counts, counts)
 
 
 @pytest.mark.parametrize('rows', [1, 2])
