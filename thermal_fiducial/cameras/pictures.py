@@ -75,9 +75,12 @@ class Pictures:
         """Nothing to release."""
 
     def _all(self) -> Iterator[Counts]:
-        yield from self._one_pass()
-        while self._repeat:
-            yield from self._one_pass()
+        shown = True
+        while shown:
+            shown = False
+            for picture in self._one_pass():
+                yield picture
+                shown = self._repeat
 
     def _one_pass(self) -> Iterator[Counts]:
         for picture in self._files() if self._path.is_dir() else self._video():

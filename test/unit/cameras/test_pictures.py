@@ -54,6 +54,16 @@ def test_it_ends_where_it_may(folder):
         shown(source, 1)
 
 
+def test_a_folder_that_is_emptied_ends(folder):
+    source = Pictures(str(folder), 1000.0)
+    source.open()
+    shown(source, 3)
+    for path in folder.iterdir():
+        path.unlink()
+    with pytest.raises(EndOfFramesError):
+        shown(source, 4)
+
+
 def test_a_slow_rate_does_not_hold_the_reader(folder):
     source = Pictures(str(folder), 0.1)
     source.open()
