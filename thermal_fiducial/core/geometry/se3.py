@@ -236,6 +236,15 @@ def narrow_sides(quads: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(squared_sides(quads).min(axis=1)))
 
 
+def widths(quads: FloatArray) -> FloatArray:
+    """Widths (Q,) of quadrilaterals (Q, 4, 2): their areas over their longest sides.
+
+    Of a square that is turned away about its diagonal all sides stay long, and the opposite ones come near.
+    """
+    (u, v), (w, z) = (quads[:, 2] - quads[:, 0]).T, (quads[:, 3] - quads[:, 1]).T
+    return np.asarray(0.5 * np.abs(u * z - v * w) / np.sqrt(squared_sides(quads).max(axis=1) + TINY))
+
+
 def diagonals(quads: FloatArray) -> FloatArray:
     """Lengths (Q,) of the diagonals of quadrilaterals (Q, 4, 2) from their first corners."""
     return np.asarray(np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1))

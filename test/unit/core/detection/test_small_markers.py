@@ -97,9 +97,14 @@ def sizes(corners):
 
 
 @pytest.mark.parametrize('optics_px', [0.6, 0.75, 0.9])
-@pytest.mark.parametrize(('side', 'tilt_deg'), [(13, 0.0), (14, 30.0), (18, 45.0)])
-def test_small_markers_in_counts_have_their_size_in_and_out_of_focus(side, tilt_deg, optics_px):
-    """By sides they are too small by up to 0.03, as cells behind the sides and the end of the surface show in them."""
+@pytest.mark.parametrize(
+    ('side', 'tilt_deg', 'fewest'), [(13, 0.0, 16), (14, 30.0, 16), (18, 45.0, 16), (38, 70.0, 12)]
+)
+def test_small_markers_in_counts_have_their_size_in_and_out_of_focus(side, tilt_deg, fewest, optics_px):
+    """By sides they are too small by up to 0.03, as cells behind the sides and the end of the surface show in them.
+
+    Of one of 38 px that is turned away about its diagonal the sides stay long.
+    """
     dictionary, errors, squares, ratios = load_dictionary('STENCIL_4X4_100'), [], [], []
     for seed in range(2):
         rng = np.random.default_rng([seed, side])
@@ -110,7 +115,7 @@ def test_small_markers_in_counts_have_their_size_in_and_out_of_focus(side, tilt_
         true = corners_px(rows) - error
         errors, squares = [*errors, error], [*squares, square]
         ratios.append(sizes(corners_px(rows)) / sizes(true) - 1.0)
-    assert len(np.concatenate(ratios)) >= 16
+    assert len(np.concatenate(ratios)) >= fewest
     # At most 0.0003, and 0.01 to 0.03 px, when this was written; 0.001 to 0.028 and 0.07 to 0.29 px by sides.
     assert abs(np.median(np.concatenate(ratios))) < 0.001
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.04

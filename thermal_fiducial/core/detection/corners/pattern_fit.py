@@ -38,7 +38,7 @@ from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.prediction.frame import Frame
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry.camera import ImagePoints
-from thermal_fiducial.core.geometry.se3 import diagonals, narrow_sides, sides_px, squared_sides
+from thermal_fiducial.core.geometry.se3 import diagonals, sides_px, squared_sides, widths
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY
 
 # Bound on the number of false markers in a picture, were all of it squares with a black border around random bits.
@@ -147,7 +147,7 @@ def are_fitted_whole(corners_px: FloatArray, cells: int, blur_px: float, *, disp
 
 
 def _have_cells_below(blurs: float, corners_px: FloatArray, cells: int, blur_px: float) -> BoolArray:
-    return np.asarray(narrow_sides(corners_px) < blurs * blur_px * cells)
+    return np.asarray(widths(corners_px) < blurs * blur_px * cells)
 
 
 def fitted_patterns(
