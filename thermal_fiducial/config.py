@@ -455,7 +455,7 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
     polarity: str = param(
         'alike',
         'Polarity that a blind search accepts: dark (colder than the background), bright, any, or alike: the polarity '
-        'of the markers seen in the last seconds.',
+        'of the markers seen in the last half minute.',
         choices=('alike', 'any', 'dark', 'bright'),
         dynamic=True,
     )
@@ -539,7 +539,8 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
     publish_marker_tf: bool = param(False, 'Publish each marker as marker_ID on /tf (needs tf2_ros).')
     duplicates: str = param(
         'drop',
-        'An ID seen twice in a frame (a reflection, say). drop: discard both; best: keep the better correlated one.',
+        'An ID that a blind search sees twice (a reflection, say). drop: discard both; best: keep the better '
+        'correlated one. One that is followed stays where it is.',
         choices=('drop', 'best'),
         dynamic=True,
     )

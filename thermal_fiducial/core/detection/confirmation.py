@@ -44,9 +44,6 @@ _WIDE_CELL_PX = 8.0
 # best had 0.90. Blur of less than 0.3 cells and noise of 0.05 contrasts leave more than 0.98, warmth that differs by a
 # third from one side of a marker to the other leaves 0.99.
 _SIMILAR, _SIMILAR_IF_CLEAR = 0.82, 0.92
-# Standard deviation of corners below which the contrast beside them is even [px]: by ``OF_UNEVEN_CONTRAST_PX`` it
-# changes by 6 % from cell to cell, a third over a marker. Corners of half-warm markers claim 0.05 and more.
-_EVEN_PX = 0.04
 # Least margin over the runner-up, as a share of the marker's isolation. It suffices for dictionaries that correct at
 # least _MANY_BITS wrong bits; noise and clutter often resemble one of the patterns of a 4 x 4 dictionary a little.
 _CLEAR_MARGIN = 0.5
@@ -226,20 +223,20 @@ def _readable(
     reading = _read(frame.image, corners, tails, decoder)
     known = near & reading.clear(config.guided_min_correlation, config.guided_min_margin)
     still = np.sqrt(np.sum(blur.spread**2, axis=1)) < _LITTLE / decoder.cells * se3.sides_px(corners)
-    clear = still & (frame.displayed | _sharp_and_even(markers.observed))
+    clear = still & (frame.displayed | _sharp(markers.observed))
     similar = np.abs(reading.correlation) >= np.where(clear, _SIMILAR_IF_CLEAR, _SIMILAR)
     distinct = (similar | (decoder.correctable >= _MANY_BITS)) & _stands_out(reading, decoder)
     return np.asarray((reading.ids == markers.ids) & (known | distinct))
 
 
-def _sharp_and_even(refined: RefinedCorners) -> BoolArray:
-    """Which markers (N,) show neither blur or noise nor a gradient of warmth that a pattern might differ by."""
-    return np.asarray((refined.noise < BLURRED_OUT * np.abs(refined.contrast)) & (refined.mean_variance < _EVEN_PX**2))
+def _sharp(refined: RefinedCorners) -> BoolArray:
+    """Which markers (N,) show neither blur nor noise that a pattern might differ by."""
+    return np.asarray(refined.noise < BLURRED_OUT * np.abs(refined.contrast))
 
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:
     """Readings of quadrilaterals (Q, 4, 2), at half resolution if all are large enough."""
-    if np.sqrt(se3.squared_sides(quads).min()) < _WIDE_CELL_PX * decoder.cells:
+    if se3.narrow_sides(quads).min() < _WIDE_CELL_PX * decoder.cells:
         return decoder.read(image, quads, lag_tails=lag_tails)
     half_tails = None if lag_tails is None else halfway(lag_tails)
     return decoder.read(halved(image), halfway(quads), lag_tails=half_tails)

@@ -6,7 +6,7 @@ import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.finding.search import BlindSearch, inside_out, SearchScales
-from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
+from thermal_fiducial.core.detection.patterns import Decoder, Reading, sampled, shrunk
 from thermal_fiducial.core.detection.prediction.frame import Frame, Places
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -40,6 +40,15 @@ def frame_of(image):
 
 def search(image, config=None, allowed=EVERY):
     return SEARCH.search(frame_of(image), allowed, config or ArucoDetectorConfig(), FoundMarkers.none())
+
+
+def test_more_outlines_than_opencv_interpolates_at_once():
+    """As a picture of a fine grid has: 2^15 rows are too many for it."""
+    image = scene(13, 100.0, 1.0)
+    places = np.random.default_rng(0).uniform(0.0, 500.0, (2, 40_000, 3)).astype(np.float32)
+    found = sampled(image, places)
+    parts = [sampled(image, part) for part in np.split(places, 8, axis=1)]
+    np.testing.assert_array_equal(found, np.concatenate(parts))
 
 
 @pytest.mark.parametrize('turn', range(4))

@@ -32,6 +32,8 @@ from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, 
 LEAST_DEPTH = 1e-3
 # Number of gray levels up to which a frame counts as a picture for a display.
 _LEVELS = 256
+# Rows that are looked at for it are so far apart: the first one alone may be dead, or carry telemetry.
+_ROW_STEP = 16
 # Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken
 # from, a cubic one displaces them by up to 0.04 px.
 _EXACT = cv2.INTER_LANCZOS4
@@ -96,7 +98,7 @@ class Frame:
         keep_columns: bool,
     ) -> 'Frame':
         """A frame; the fixed pattern of its columns is removed unless ``keep_columns`` or the pixels have 8 bits."""
-        noise, displayed = pixel_noise(counts), bool(counts[::64].max() < _LEVELS)
+        noise, displayed = pixel_noise(counts), bool(counts[::_ROW_STEP].max() < _LEVELS)
         lag, readout = config.bolometer_lag, config.readout_time
         image = counts.astype(np.float32)
         if counts.dtype != np.uint8 and not keep_columns:
