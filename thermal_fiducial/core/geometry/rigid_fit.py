@@ -30,6 +30,8 @@ _AHEAD = se3.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])
 #: Ridge that keeps information matrices regular, as a share of their largest entry.
 SINGULAR = 1e-12
 _MINUS_SKEW = -se3.SKEW
+#: Chi square of a point, or of a view, behind the camera: of a gross outlier.
+BEHIND_CHI2 = 1e8
 
 #: At poses (B, 4, 4): cost (B,), gradient (B, 6), information (B, 6, 6).
 Evaluation = tuple[FloatArray, FloatArray, FloatArray]
@@ -113,7 +115,9 @@ def costs(T: FloatArray, points: FloatArray, images: Images, inlier: float) -> F
     z = p[..., 2:]
     residual = (images.whitening @ (p[..., :2] / np.maximum(z, TINY))[..., None])[..., 0] - images.target
     squared, _ = robust((residual * residual).sum(axis=-1), inlier**2)
-    return np.where((z > TINY).all(axis=(1, 2)), squared.sum(axis=-1), np.inf)
+    # Where there may be outliers, a point behind the camera is one: its marker may have been moved.
+    behind = robust(np.asarray(BEHIND_CHI2), inlier**2)[0] if inlier < np.inf else np.inf
+    return np.asarray(np.where(z[..., 0] > TINY, squared, behind).sum(axis=-1))
 
 
 def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> Evaluation:

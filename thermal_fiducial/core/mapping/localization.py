@@ -69,9 +69,15 @@ def locate(
     frame = kind(stamp_ns, sight, camera, model, fit)
     # Steps 3 and 4: the pose from all markers jointly, weighted by the map.
     by_map = frame.map_weights(hypotheses[0])
-    T = fit.solve(hypotheses[:1], by_map)[0][0]
+    T = hypotheses[0]
     seen = sight.reprojected(camera, T)
-    if not np.all(np.isfinite(seen.residuals)):
+    if seen.shown.all():
+        T = fit.solve(hypotheses[:1], by_map)[0][0]
+        seen = sight.reprojected(camera, T)
+    if not (shown := seen.shown).all():
+        # A marker that the camera could not show is not where the map has it. The others give the pose, if most are.
+        if 2 * np.count_nonzero(shown) > len(shown):
+            return locate(stamp_ns, sight.only(shown), camera, prior, model)
         return Refusal(f'no camera pose explains {names(sight)}')
     # Steps 5 and 6: refined with the weights of their errors.
     found = frame.refined(T, seen, frame.weights(seen, by_map))

@@ -7,7 +7,7 @@ from support.walls import CAMERA, flight, look, see, SIZE, wall
 
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference, retract
-from thermal_fiducial.core.geometry.se3 import transform
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.localization import locate, marker_weights
 from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
@@ -54,6 +54,20 @@ def test_a_marker_that_was_moved_loses_its_weight_and_hardly_moves_the_pose():
     assert np.delete(other.weights, place).min() == 1.0
     # Corners of 0.02 px at 3 m: a tenth of a millimetre.
     for outcome in (found, other):
+        assert np.abs(difference(outcome.pose.T_map_camera, T)).max() < 1e-3
+
+
+def test_a_marker_whose_place_is_behind_the_camera_hardly_moves_the_pose():
+    """One that now hangs elsewhere; the right pose must not have an infinite cost for it."""
+    rng = np.random.default_rng(1)
+    poses = wall(rng)
+    behind = transform(so3_exp([0.0, 0.0, np.pi]) @ poses[2][:3, :3], [-8.0, 0.3, 1.5])
+    for seconds in range(0, 20, 2):
+        T = flight(float(seconds))
+        rows = see(T, poses, 0.02, rng)
+        if 2 not in rows['id'] or len(rows) < 4:
+            continue
+        outcome = located(T, poses | {2: behind}, rows)
         assert np.abs(difference(outcome.pose.T_map_camera, T)).max() < 1e-3
 
 
