@@ -68,10 +68,14 @@ class MotionPrior:
         """The instant of a frame in the clock of the odometry [ns]."""
         return camera_stamp_ns + self._offset_ns
 
+    def forget(self) -> None:
+        """Drop all states: they are in a map that was replaced."""
+        self._stamps_ns, self._states = [], []
+
     def add(self, stamp_ns: int, state: Any) -> None:
         """Keep the state of a stamp, decoded or not."""
         if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - _REORDERED_NS:
-            self._stamps_ns, self._states = [], []
+            self.forget()
         place = bisect_left(self._stamps_ns, stamp_ns)
         if place < len(self._stamps_ns) and self._stamps_ns[place] == stamp_ns:
             self._states[place] = state

@@ -36,8 +36,9 @@ class MapKeeper:
         self._path = path
         self._sizes = marker_size, size_overrides
         self._flown = flown
-        # Digest of the file that the map was made from. 'nothing' matches no file: an unread one is not overwritten.
-        self._read = 'nothing'
+        # Digests of the file that the map was made from, and of the one read last. 'nothing' matches no file: an unread
+        # one is not overwritten.
+        self._read = self._at_hand = 'nothing'
         self._own_autosave = False
         self._writer: Thread | None = None
         #: why the last autosave could not be written; empty if it was
@@ -68,10 +69,23 @@ class MapKeeper:
         InputError
             There is no file, or it cannot be read.
         """
-        read = map_history.digest(self.path)
-        marker_map = load_map(self.path, *self._sizes)
-        self._read, self.unsaved = read, False
+        marker_map = self.read()
+        self.take()
         return marker_map
+
+    def read(self) -> MarkerMap:
+        """The map in the file, which :meth:`take` makes the one at hand; raises as :meth:`load`."""
+        self.finish()
+        digest = map_history.digest(self.path)
+        marker_map = load_map(self.path, *self._sizes)
+        self._at_hand = digest
+        return marker_map
+
+    def take(self) -> None:
+        """The map that was read last replaces the one before, what that has not saved included."""
+        self._read, self.unsaved = self._at_hand, False
+        if self._own_autosave:
+            self._retire_autosave()
 
     def recover(self, autosave_period: float) -> tuple[MarkerMap | None, str]:
         """The autosaved map of a mapper that has just crashed (or None), and a message about an autosave.

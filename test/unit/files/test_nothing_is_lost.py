@@ -85,6 +85,25 @@ def test_a_crashed_mapper_recovers_its_map(path):
     assert not map_history.autosave_file(path).exists()
 
 
+def test_a_map_that_a_load_has_discarded_does_not_come_back(path):
+    keeper = keeper_of(path)
+    autosaved(keeper, grown(2))
+    keeper.load()
+    restarted = MapKeeper(path, 0.3, {})
+    restarted.load()
+    assert restarted.recover(AUTOSAVE_S) == (None, '')
+
+
+def test_a_map_that_came_too_late_to_be_taken_replaces_nothing(path):
+    """A disk was busy for longer than the service waits; meanwhile another program has changed the file."""
+    keeper = keeper_of(path)
+    save_map(path, grown(5))
+    keeper.read()
+    assert keeper.unsaved
+    assert keeper.save(grown(2)) != path
+    assert whole(path) == 5
+
+
 def test_an_unused_autosave_is_kept_beside_a_newer_one(path):
     autosaved(keeper_of(path), grown(2))
     autosaved(keeper_of(path), grown(3))

@@ -63,6 +63,7 @@ class MapServices:
         if not config.map_file:
             return empty
         loaded = node.attempt(self._read, empty)
+        self._keeper.take()
         may_recover = node.live and config.mode == 'mapping'
         recovered, note = self._keeper.recover(config.autosave_period if may_recover else 0.0)
         if note:
@@ -70,7 +71,7 @@ class MapServices:
         return loaded if recovered is None else recovered
 
     def _read(self) -> MarkerMap:
-        loaded = self._keeper.load()
+        loaded = self._keeper.read()
         self._node.get_logger().info(f'map of {loaded.size_in_words} from {self._keeper.path}')
         config, folder = self._node.config, self._keeper.path.parent
         self._other_dictionary = other_patterns(loaded.markers, loaded.dictionary, config.dictionary, folder)
@@ -119,6 +120,7 @@ class MapServices:
         """Reload the map file, for example after edits with ``thermal-fiducial map``."""
         self._refuse_frozen()
         loaded = self._in_time(self._read)
+        self._keeper.take()
         self._publish_jump(self.mapper.load(loaded))
         return f'{loaded.size_in_words} loaded from {self._keeper.path}'
 
