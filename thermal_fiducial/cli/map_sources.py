@@ -248,6 +248,7 @@ def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, cam
     if not len(table):
         raise InputError(f'{path}: no detections')
     _require_inside(path, table[:, 3:].reshape(-1, 4, 2), camera)
+    table = table[np.argsort(table[:, 0], kind='stable')]
     stamps, firsts = np.unique(table[:, 0], return_index=True)
     sizes = size_overrides(tuple(args.marker_size_override))
     sizes |= {key: marker.size for key, marker in start.markers.items()}

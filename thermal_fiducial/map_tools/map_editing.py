@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.reprojection import turned
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, lever_arm, turned
 from thermal_fiducial.core.geometry.se3 import apply, rigid_alignment
 from thermal_fiducial.core.mapping.map_data import align, Alignment, MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
@@ -97,25 +97,41 @@ def merge(resting: MarkerMap, moving: MarkerMap) -> tuple[MarkerMap, Alignment]:
         raise InputError(f'the maps are of different dictionaries: {resting.dictionary} and {moving.dictionary}')
     alignment = align(resting.markers, moving.markers)
     moved = transformed(moving, alignment.T).markers
-    agreeing = [r for key, r in alignment.residuals_m.items() if key not in alignment.outliers]
-    mean_square = float(np.mean(np.square(agreeing)))
-    spread = float(np.mean([np.linalg.norm(moved[key].T_map_marker[:3, 3]) for key in moved])) or 1.0
-    slack = np.diag([mean_square / 3.0] * 3 + [mean_square / max(spread, 0.1) ** 2] * 3)
+    agreeing = [key for key in alignment.residuals_m if key not in alignment.outliers]
+    middle, slack = _misfit(resting, moved, agreeing, alignment)
     changes: dict[int, MapMarker] = {}
     for key, marker in moved.items():
         own = resting.markers.get(key)
         if own is None:
-            changes[key] = replace(marker, fixed=False, covariance=marker.covariance + slack)
+            arm = lever_arm(marker.T_map_marker[:3, 3] - middle)
+            changes[key] = replace(marker, fixed=False, covariance=marker.covariance + arm @ slack @ arm.T)
         elif key not in alignment.outliers and not own.fixed:
             better = marker if np.trace(marker.covariance) < np.trace(own.covariance) and marker.trusted else own
             changes[key] = replace(
                 better,
                 fixed=False,
                 observations=own.observations + marker.observations,
-                first_seen_ns=min(own.first_seen_ns, marker.first_seen_ns),
+                first_seen_ns=min((seen for seen in (own.first_seen_ns, marker.first_seen_ns) if seen), default=0),
                 last_seen_ns=max(own.last_seen_ns, marker.last_seen_ns),
             )
     return _changed(resting, changes), alignment
+
+
+def _misfit(
+    resting: MarkerMap, moved: Mapping[int, MapMarker], common: list[int], alignment: Alignment
+) -> tuple[FloatArray, FloatArray]:
+    """Middle (3,) of the common markers, about which an alignment turns the others, and its covariance (6, 6) there.
+
+    One common marker fits exactly: it shows no misfit, and the errors of both of its poses count.
+    """
+    markers = [moved[key] for key in common]
+    corners = corners_in_map(np.stack([m.T_map_marker for m in markers]), np.array([m.size for m in markers]))
+    middle = corners.mean(axis=(0, 1))
+    if len(common) == 1:
+        return middle, markers[0].covariance + resting.markers[common[0]].covariance
+    mean_square = float(np.mean(np.square([alignment.residuals_m[key] for key in common])))
+    spread = float(np.mean(np.sum((corners - middle) ** 2, axis=-1)))
+    return middle, np.diag([mean_square / 3.0] * 3 + [mean_square / spread] * 3)
 
 
 def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[MarkerMap, dict[int, float]]:

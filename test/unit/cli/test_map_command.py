@@ -14,7 +14,7 @@ from thermal_fiducial.cli import map_sources
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.cli.map_plot import draw_map
 from thermal_fiducial.cli.run_parameters import camera_of_run
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, retract
 from thermal_fiducial.core.geometry.se3 import apply, inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
@@ -22,7 +22,7 @@ from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.map_tools.map_building import build_map
 from thermal_fiducial.map_tools.map_doubts import doubts
-from thermal_fiducial.map_tools.map_editing import transformed
+from thermal_fiducial.map_tools.map_editing import merge, transformed
 
 
 @pytest.fixture
@@ -175,6 +175,40 @@ def test_anchor_moves_the_map_onto_a_survey(path, poses):
     assert run('anchor', path, survey) == 2
 
 
+@pytest.mark.parametrize('common', [1, 3])
+def test_a_merged_marker_claims_what_the_common_ones_leave_open(common):
+    """Ten metres beside them: what they are turned by moves it most."""
+    poses, stds = wall(np.random.default_rng(0)), np.repeat((0.003, 0.01), 3)
+    places = {key: poses[key] for key in range(common)} | {9: retract(poses[0], [0.0, 10.0, 0.0, 0.0, 0.0, 0.0])}
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        maps = [
+            MarkerMap(
+                {
+                    key: MapMarker(key, SIZE, False, retract(places[key], stds * rng.normal(size=6)), np.diag(stds**2))
+                    for key in ids
+                }
+            )
+            for ids in (range(common), places)
+        ]
+        added = merge(*maps)[0].markers[9]
+        d = difference(added.T_map_marker, places[9])
+        squares.append(d @ np.linalg.solve(added.covariance, d))
+    # Misfits of three markers scatter by a third; without the way to the marker it is 15.
+    assert 0.4 < np.mean(squares) / 6.0 < 1.5
+
+
+def test_markers_in_quarantine_align_no_maps():
+    poses = wall(np.random.default_rng(0))
+    maps = [MarkerMap({key: MapMarker(key, SIZE, key == 0, poses[key]) for key in ids}) for ids in ((0, 1), (0, 1, 3))]
+    moved = maps[1].markers[1]
+    off = retract(moved.T_map_marker, [0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
+    maps[1].markers[1] = replace(moved, T_map_marker=off, trusted=False)
+    merged, _ = merge(*maps)
+    assert np.abs(difference(merged.markers[3].T_map_marker, poses[3])).max() < 1e-9
+
+
 def test_refine_adjusts_a_map_to_the_detections_of_a_run(path, poses):
     run_folder = path.with_name('run')
     run_folder.mkdir()
@@ -206,6 +240,16 @@ def test_refine_counts_the_frames_that_gave_nothing_by_reason(path, poses, photo
     photographed[0].write_text('\n'.join([*lines, *(f'{stamp(k)},40,{corners}' for k in (400, 500))]))
     assert run('--marker-size', SIZE, 'refine', path, *photographed) == 0
     assert '30 of 32 frames used\n2 not used: no known marker in view\n' in capsys.readouterr().out
+
+
+def test_refine_takes_detections_in_any_order(path, poses, photographed, capsys):
+    """Sorted by marker, as a spreadsheet leaves them."""
+    save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
+    head, *lines = photographed[0].read_text().splitlines()
+    photographed[0].write_text('\n'.join([head, *sorted(lines, key=lambda line: int(line.split(',')[1]))]))
+    assert run('--marker-size', SIZE, 'refine', path, *photographed) == 0
+    assert '30 of 30 frames used' in capsys.readouterr().out
+    assert sorted(load_map(path).markers) == sorted(poses)
 
 
 @pytest.fixture
