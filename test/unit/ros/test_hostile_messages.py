@@ -316,6 +316,7 @@ HOSTILE_MARKERS = {
     'NaN covariance': cloud(MARKER_DTYPE, c0uv=np.nan, c0uu=np.nan),
     'vast covariance': cloud(MARKER_DTYPE, c2vv=1e30),
     'far pose': cloud(MARKER_DTYPE, x=1e30),
+    'ID that no map can hold': cloud(MARKER_DTYPE, id=3_000_000_000),
     'promises': promising(cloud(MARKER_DTYPE)),
     'fractional': fractional(cloud(MARKER_DTYPE)),
     'stamp': impossible_stamp(cloud(MARKER_DTYPE)),

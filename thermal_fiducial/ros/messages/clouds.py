@@ -43,6 +43,8 @@ _POINT_CODES = {code: datatype for datatype, code in _POINT_TYPES.items()}
 _MOST_ROWS = 20_000
 # (1e-4 px)^2, below what any corner detection achieves [px^2].
 _SMALLEST_CORNER_VARIANCE = 1e-8
+# Largest ID that a map file can hold.
+_LARGEST_ID = 2**31 - 1
 # Longest side of a marker [m].
 _LARGEST_MARKER = 100.0
 # Two uint32: height and width, or row_step and length of the data.
@@ -212,6 +214,8 @@ def _checked(rows: Markers) -> Markers:
     # A marker without a pose has NaN there.
     if (np.abs(columns(rows, _POSE_FIELDS)) > LARGEST_COORDINATE).any():
         raise InputError('markers with poses beyond all bounds')
+    if rows['id'].max(initial=0) > _LARGEST_ID:
+        raise InputError(f'marker {rows["id"].max()}, beyond any dictionary')
     return rows
 
 
