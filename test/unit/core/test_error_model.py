@@ -174,7 +174,9 @@ def test_the_scale_of_a_map_moves_the_camera_as_one():
     fixed = poses[min(poses)][:3, 3]
     arms = arms_of_scale(np.array([T[:3, 3] for T in poses.values()]), fixed[None])
     claimed = dict(zip(poses, scale_of_map(arms, ERRORS), strict=True))
-    uncertain = MarkerMap({i: MapMarker(i, SIZE, i == min(poses), T, claimed[i]) for i, T in poses.items()})
+    uncertain = MarkerMap(
+        {i: MapMarker(i, SIZE, i == min(poses), T, claimed[i], observations=1) for i, T in poses.items()}
+    )
     rows = see(flight(0.0), poses, 1e-3, rng)
     config = MarkerMapperConfig(mode='localization', focal_length_std=0.0)
     pose = MarkerMapper(config, uncertain).process(stamp(0), rows, CAMERA).pose

@@ -9,13 +9,13 @@ from thermal_fiducial.config import CHI2_OF_POSE
 from thermal_fiducial.core.error_model import CHI2_OF_VIEW, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, linearise, retract, whitening
-from thermal_fiducial.core.geometry.rigid_fit import robust
+from thermal_fiducial.core.geometry.rigid_fit import BEHIND_CHI2, robust
 from thermal_fiducial.core.mapping.map_data import exact, gauge, MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
-# Chi square of a view whose marker is behind the camera.
-_BEHIND_CHI2 = 1e8
+# Variance that is added to those of priors [m^2, rad^2]: no place is known better than to 0.1 mm and mrad.
+_LEAST_VARIANCE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,12 @@ class Snapshot:
         useful = of_map & ((number >= 2) | has_odometry)[self.frame]
         seen = np.unique(self.ids[useful])
         held = self.held(seen)
-        reached = np.isin(self.ids, [*seen[held], *self.known]) | has_odometry[self.frame]
+        by_odometry = has_odometry[self.frame]
+        reached = np.isin(self.ids, [*seen[held], *self.known]) | (by_odometry & held.any())
         while True:
             joined = useful & np.isin(self.frame, self.frame[useful & reached])
-            more = reached | np.isin(self.ids, self.ids[joined])
+            # Odometry connects all frames that have it, but with the map only where its frame is known.
+            more = reached | np.isin(self.ids, self.ids[joined]) | (by_odometry & by_odometry[joined].any())
             if np.array_equal(more, reached):
                 return np.asarray(joined)
             reached = more
@@ -208,7 +210,7 @@ class MapProblem:
         J_camera[behind], J_marker[behind] = 0.0, 0.0
         residuals = np.where(behind[:, None, None], 0.0, self.corners - uv)
         r = (self.W @ residuals[..., None]).reshape(n, 8)
-        chi2 = np.where(behind, _BEHIND_CHI2, np.sum(r * r, axis=-1))
+        chi2 = np.where(behind, BEHIND_CHI2, np.sum(r * r, axis=-1))
         J_camera, J_marker = ((self.W @ J.reshape(n, 4, 2, 6)).reshape(n, 8, 6) for J in (J_camera, J_marker))
         squared_px = np.sum(residuals**2, axis=(1, 2))
         of_cameras = self.odometry.moved(state.T_map_odometry).apart(state.T_map_camera)
@@ -310,5 +312,5 @@ def _known(snapshot: Snapshot, ids: IntArray, T_map_marker: FloatArray) -> Prior
     for index, key in enumerate(ids.tolist()):
         if key in snapshot.known:
             T[index], covariance = snapshot.known[key]
-            information[index] = np.linalg.inv(covariance)
+            information[index] = np.linalg.inv(covariance + _LEAST_VARIANCE * np.eye(6))
     return Priors(T, information)

@@ -85,6 +85,8 @@ class Candidate:
         views = MarkerViews(self.views, self.size, camera, errors)
         fits = views.fit(self._starts)
         if not fits.chi2[0] <= INCONSISTENT * len(self.views):
+            if len(self.views) >= 2 * MIN_VIEWS:
+                self._drop_farthest()
             return f'marker {self.id}: its views contradict each other'
         scale = noise_factor(float(fits.chi2[0]), 8 * len(self.views) - 6)
         others = np.flatnonzero(rotation_angle(fits.T[0, :3, :3].T @ fits.T[:, :3, :3]) > SAME_POSE)
@@ -115,6 +117,12 @@ class Candidate:
         directions = self._directions
         cosines = directions @ directions.T - 2.0 * np.eye(len(self.views))
         del self.views[int(np.argmax(np.max(cosines, axis=1)))]
+
+    def _drop_farthest(self) -> None:
+        """Drop the view that shows the marker farthest from where most do: another one may have been read as this."""
+        places = np.stack([(view.viewpoint.T_map_camera[0] @ view.branches[0])[:3, 3] for view in self.views])
+        off = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+        del self.views[int(np.argmax(off))]
 
     @property
     def _directions(self) -> FloatArray:
@@ -160,7 +168,7 @@ class NewMarkers:
             if isinstance(outcome, str):
                 candidate.reason = outcome
                 continue
-            placed.append(replace(outcome, first_seen_ns=stamp_ns, last_seen_ns=stamp_ns))
+            placed.append(replace(outcome, observations=1, first_seen_ns=stamp_ns, last_seen_ns=stamp_ns))
             del self.candidates[candidate.id]
         while len(self.candidates) > MOST:
             del self.candidates[min(self.candidates, key=lambda key: self.candidates[key].views[-1].stamp_ns)]

@@ -86,7 +86,7 @@ def settled(
         covariance=one.pose.covariance + spread,
         map_covariance=one.pose.map_covariance + spread,
     )
-    return replace(found, pose=pose)
+    return replace(found, pose=pose, noise=found.noise + spread, settled=False)
 
 
 def contradicting(sight: Sight) -> Refusal:

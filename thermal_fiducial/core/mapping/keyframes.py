@@ -82,8 +82,8 @@ def snapshot_of(
 def prior_poses(markers: Mapping[int, MapMarker]) -> dict[int, tuple[FloatArray, FloatArray]]:
     """Prior poses and covariances (6, 6) of markers that the map had before the keyframes.
 
-    A map contains the covariance of each marker, without correlations between markers. Those that were surveyed one by
-    one have none.
+    A map contains the covariance of each marker, without correlations between markers: those bound the joint covariance
+    of as many as are used. Markers that were surveyed one by one have none.
     """
     known = [m for m in markers.values() if not m.fixed and np.any(m.covariance)]
     related = sum(not m.surveyed for m in known)
@@ -133,7 +133,8 @@ class KeyframeStore:
         self.frames: dict[int, Keyframe] = {}
         #: stamps of keyframes that only odometry connects with the others: never dropped
         self.bridges: set[int] = set()
-        self._priors = prior_poses(marker_map.markers)
+        #: the markers of that map
+        self._before = dict(marker_map.markers)
         self._adjustment = LastAdjustment(markers=len(marker_map.markers))
         #: frames that were ever added
         self._added = 0
@@ -205,7 +206,9 @@ class KeyframeStore:
         number = sum(len(frame.ids) for frame in frames)
         self._adjustment = LastAdjustment(next(reversed(self.frames)), len(self.frames), number, markers, self._added)
         trusted = {key: marker for key, marker in marker_map.markers.items() if marker.trusted}
-        return snapshot_of(trusted, frames, self._priors, marker_map.revision, errors)
+        seen = set(np.concatenate([frame.ids for frame in frames]).tolist())
+        priors = prior_poses({key: marker for key, marker in self._before.items() if key in seen})
+        return snapshot_of(trusted, frames, priors, marker_map.revision, errors)
 
     def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
         """Take over adjusted poses by stamp; other keyframes move with the nearest adjusted one in time."""

@@ -92,6 +92,11 @@ class Reprojected:
     J_marker: FloatArray
 
     @cached_property
+    def shown(self) -> BoolArray:
+        """Which markers (N,) the camera can show."""
+        return np.asarray(np.isfinite(self.residuals).all(axis=(1, 2)))
+
+    @cached_property
     def errors_px(self) -> FloatArray:
         """Rms error (N,) [px] of each marker; NaN behind the camera."""
         return np.asarray(np.sqrt((self.residuals**2).sum(axis=(1, 2)) / 4.0))
@@ -209,11 +214,11 @@ class LocatedFrame:
     def known_errors(self, location: Location) -> tuple[FloatArray, FloatArray]:
         """Rms errors (K,) [px] of the K known markers, and their standard deviations (K,) by noise, pose and map.
 
-        The error of a marker behind the camera is the image's width.
+        That of a marker behind the camera is the image's width, and so is any larger one.
         """
         known, pose = self.known, location.pose
         seen = location.seen if location.sight is known else known.reprojected(self.camera, pose.T_map_camera)
-        errors = np.where(np.isfinite(seen.errors_px), seen.errors_px, float(self.camera.width))
+        errors = np.fmin(seen.errors_px, float(self.camera.width))
         return errors, error_std_px(known, seen, pose.covariance)
 
     def left_out(self, location: Location) -> BoolArray:

@@ -24,6 +24,8 @@ _OUTLIER = 4.0
 # Residual that is never an outlier [m].
 _TOLERANCE_M = 0.01
 _REWEIGHTINGS = 4
+# Largest number of observations that a row can carry.
+_MOST_COUNTED = 2**32 - 1
 #: Weight of a new frame in what is known of a marker: a memory of 20 frames.
 MEMORY = 0.05
 
@@ -116,7 +118,7 @@ class MarkerMap:
         covariances = np.stack([marker.covariance for marker in vague])
         of_scale = scale_of_map(arms_of_scale(positions, self.anchors), errors)
         placed = np.array([marker.observations > 0 for marker in vague])
-        draws = assumed_draws(positions, covariances - of_scale, placed)
+        draws = assumed_draws(positions, covariances - placed[:, None, None] * of_scale, placed)
         drawn = {
             marker.id: replace(marker, draws=own, surveyed=not by_mapper)
             for marker, own, by_mapper in zip(vague, draws, placed.tolist(), strict=True)
@@ -148,7 +150,8 @@ class MarkerMap:
         variances = np.stack([marker.covariance for marker in markers])[:, [0, 1, 2], [0, 1, 2]]
         rows['sigma_m'] = np.sqrt(np.maximum(np.mean(variances, axis=1), 0.0))
         rows['rms_px'] = [marker.reprojection_error_px for marker in markers]
-        for name in ('id', 'size', 'observations', 'fixed', 'trusted'):
+        rows['observations'] = [min(marker.observations, _MOST_COUNTED) for marker in markers]
+        for name in ('id', 'size', 'fixed', 'trusted'):
             rows[name] = [getattr(marker, name) for marker in markers]
         rows['in_view'] = [marker.id in in_view for marker in markers]
         return rows
@@ -212,7 +215,8 @@ class Alignment:
 def align(resting: Mapping[int, MapMarker], moving: Mapping[int, MapMarker]) -> Alignment:
     """Rigid transform that takes ``moving`` onto ``resting``, by the corners of the markers that both have.
 
-    Least squares; markers that disagree with the others (moved between the two surveys) are left out.
+    Least squares; markers that disagree with the others (moved between the two surveys) are left out, and those in
+    quarantine where there are others.
 
     Raises
     ------
@@ -220,6 +224,7 @@ def align(resting: Mapping[int, MapMarker], moving: Mapping[int, MapMarker]) -> 
         No marker in common, or sizes that differ.
     """
     common = sorted(resting.keys() & moving.keys())
+    common = [key for key in common if resting[key].trusted and moving[key].trusted] or common
     if not common:
         raise InputError('the maps have no marker in common')
     for key in common:

@@ -91,6 +91,10 @@ class MarkerMapper:
 
     def use_map_of(self, owner: 'MarkerMapper') -> None:
         """Locate in the map of ``owner`` as it is now, and change nothing in it, quarantine included."""
+        if owner._initial is not self._initial:
+            # Poses in a map that was replaced say nothing of this one.
+            self._initial, self._last = owner._initial, None
+            self._consistency = Consistency(owner.map.markers)
         self.map = owner.map
         self.frozen, self._owns_map = True, False
 

@@ -5,14 +5,16 @@ import re
 
 import numpy as np
 import pytest
+from support.scenes import motion_prior
 from support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import NO_DRAWS
-from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.measurements import MARKER_DTYPE
+from thermal_fiducial.core.measurements import MARKER_DTYPE, Odometry
 
 
 def known(poses, ids=None):
@@ -278,3 +280,118 @@ def test_errors_of_surveyed_markers_are_independent_until_a_refinement_relates_t
     assert {i for i, marker in m.map.markers.items() if marker.surveyed} == {1, 2, 3}
     assert m.refine() is not None
     assert not any(marker.surveyed for marker in m.map.markers.values())
+
+
+def test_a_marker_that_was_read_as_another_once_does_not_keep_that_out_of_the_map():
+    rng = np.random.default_rng(3)
+    poses = wall(rng)
+    m, misread = mapper(known(poses, [key for key in poses if key != 5])), False
+    for k in range(0, 150, 6):
+        rows = see(flight(k / 30), poses, 0.1, rng)
+        if not misread and {3, 5} <= set(rows['id'].tolist()):
+            rows = rows[rows['id'] != 5].copy()
+            rows['id'][rows['id'] == 3] = 5
+            misread = True
+        m.process(stamp(k), rows, CAMERA)
+    assert misread
+    assert 5 in m.map.markers
+    d = difference(m.map.markers[5].T_map_marker, poses[5])
+    # 99.9 % of chi square of six degrees of freedom.
+    assert d @ np.linalg.solve(m.map.markers[5].covariance, d) < 22.5
+
+
+def test_a_marker_that_has_just_entered_is_none_that_was_surveyed():
+    """To the next mapper, even if no further frame has shown it."""
+    rng = np.random.default_rng(1)
+    poses = wall(rng)
+    m = mapper(known(poses, [0]))
+    for k in range(90):
+        placed = m.process(stamp(k), see(flight(k / 30), poses, 0.02, rng), CAMERA).map_changed
+        if placed and len(m.map.markers) > 2:
+            break
+    entered = [marker for marker in m.map.markers.values() if not marker.fixed]
+    assert min(marker.observations for marker in entered) > 0
+
+
+def test_flights_over_a_part_of_a_large_map_leave_its_claims_as_they_are():
+    """Forty markers whose correlations are unknown, without a fixed one in view; four of them are flown over."""
+    rng = np.random.default_rng(5)
+    poses, covariance = wall(rng, 40), np.diag([1e-4] * 3 + [1e-4] * 3)
+    few = {key: poses[key] for key in range(4)}
+    before = MarkerMap({key: MapMarker(key, SIZE, False, T, covariance, 0.1, 100) for key, T in poses.items()})
+    for _ in range(3):
+        m = mapper(before)
+        for k in range(0, 300, 10):
+            m.process(stamp(k), see(flight(k / 30), few, 0.1, rng), CAMERA)
+        assert m.refine() is not None
+        before = MarkerMap({key: replace(marker, draws=NO_DRAWS) for key, marker in m.map.markers.items()})
+    # Twice the variance for the bound and the lens; each flight had tripled the claim.
+    stds = [np.sqrt(np.diag(before.markers[key].covariance)) for key in few]
+    assert np.max(stds) < 0.02
+
+
+def test_what_only_odometry_connects_keeps_its_place_in_a_refinement():
+    """Markers of an earlier map before the filter has started, one beside odometry, and then new ones by that alone."""
+    rng = np.random.default_rng(0)
+    first = wall(rng, 1)[0]
+    places = {**{i: 0.8 * i for i in range(3)}, **{10 + i: 5.2 + 0.8 * i for i in range(2)}}
+    poses = {key: retract(first, [0.0, y, 0.0, 0.0, 0.0, 0.0]) for key, y in places.items()}
+    m = mapper(
+        MarkerMap({key: MapMarker(key, SIZE, False, poses[key], 2.5e-5 * np.eye(6), 0.1, 100) for key in range(3)}),
+        camera_orientation=(0.0, 0.0, 0.0, 1.0),
+        bridge_duration=10.0,
+    )
+    legs = [(0.8, False, (0, 1, 2))] * 30 + [(1.6, True, (2,))] * 20 + [(5.6, True, (10, 11))] * 60
+    for k, (y, has_odometry, ids) in enumerate(legs):
+        y += first[1, 3]
+        position = [-1.6 + 0.3 * np.sin(k / 5), y + 0.4 * np.sin(k / 9), 1.0 + 0.4 * np.sin(k / 7)]
+        T, seen_at = look(position, [0.0, y, 1.0]), stamp(3 * k)
+        prior = None
+        if has_odometry:
+            stds = np.repeat((0.01, 0.0025), 3)
+            prior = motion_prior(
+                Odometry(seen_at, T, np.zeros(3), np.zeros(3), np.diag(stds**2), np.diag((2.0 * stds) ** 2))
+            )
+        m.process(seen_at, see(T, {key: poses[key] for key in ids}, 0.1, rng), CAMERA, prior)
+    assert m.refine() is not None
+    for key in (10, 11):
+        marker = m.map.markers[key]
+        # As when it was placed: 11 mm; where its frames float, 7 m.
+        assert np.sqrt(np.diag(marker.covariance)).max() < 0.02
+        d = difference(marker.T_map_marker, poses[key])
+        assert d @ np.linalg.solve(marker.covariance, d) < 22.5
+
+
+def test_an_exact_rotation_beside_a_vague_position_is_a_prior_too():
+    """As ``map move --sigma-deg 0`` writes it."""
+    rng = np.random.default_rng(2)
+    poses = wall(rng)
+    vague = np.diag([1e-4] * 3 + [0.0] * 3)
+    m = mapper(MarkerMap({key: MapMarker(key, SIZE, False, T, vague, 0.1, 100) for key, T in poses.items()}))
+    for k in range(0, 300, 10):
+        m.process(stamp(k), see(flight(k / 30), poses, 0.1, rng), CAMERA)
+    assert m.refine() is not None
+    assert np.isfinite([marker.covariance for marker in m.map.markers.values()]).all()
+
+
+def test_a_count_beyond_what_a_row_holds_is_the_largest():
+    marker = replace(MapMarker(0, SIZE, True, wall(np.random.default_rng(0))[0]), observations=2**40)
+    assert MarkerMap({0: marker}).rows()['observations'][0] == 2**32 - 1
+
+
+def test_after_a_load_a_second_camera_forgets_its_pose_in_the_map_before():
+    rng = np.random.default_rng(7)
+    poses = wall(rng, 1, tilt=0.0)
+    T = look(poses[0][:3, 3] + [-9.0, 0.2, 0.0], poses[0][:3, 3])
+    owner, second = mapper(known(poses)), mapper(known(poses))
+    second.use_map_of(owner)
+    for k in range(20):
+        second.process(stamp(k), see(T, poses, 0.3, rng), CAMERA)
+    turned = transform(so3_exp([0.0, 0.0, np.pi / 2]), np.zeros(3))
+    moved = {key: turned @ pose for key, pose in poses.items()}
+    owner.load(known(moved))
+    second.use_map_of(owner)
+    rows = see(turned @ T, moved, 0.3, rng)
+    after = second.process(stamp(21), rows, CAMERA)
+    fresh = mapper(known(moved)).process(stamp(21), rows, CAMERA)
+    assert (after.pose is None, after.reason) == (fresh.pose is None, fresh.reason)
