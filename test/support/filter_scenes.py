@@ -325,8 +325,8 @@ def stepping_clock(seed: int, step_ns: int = 300_000_000) -> Arrivals:
 
 
 def small_step_of_clock(seed: int) -> Arrivals:
-    """It steps by less than a frame's time."""
-    return stepping_clock(seed, 25_000_000)
+    """It steps by less than delays show."""
+    return stepping_clock(seed, 10_000_000)
 
 
 def lasting_errors(seed: int) -> Arrivals:

@@ -26,7 +26,6 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('marker_mapper', MarkerMapperConfig, **kwargs)
         self._map = MapServices(self, self._publish_jump)
-        self.endings.append(self._map.close)
         self.mapper = self._map.mapper
         self._result = MapperResult(0, None, 'no markers yet')
         self._topics = MapTopics(self)

@@ -31,7 +31,7 @@ _LAST_REFINEMENT_S = 3.0
 
 
 class MapServices:
-    """Creates the mapper of ``node`` from its map file, and offers the map services.
+    """Creates the mapper of ``node`` from its map file, offers the map services, and saves the map when it ends.
 
     Parameters
     ----------
@@ -50,6 +50,7 @@ class MapServices:
         self._other_dictionary = ''
         self.mapper = MarkerMapper(config, self._first_map())
         self.refinement = MapRefinement(self.mapper, live=node.live)
+        node.endings.append(self.close)
         for name in ('save', 'load', 'undo', 'reset', 'refine'):
             node.serve(Trigger, f'~/{name}', _answer(getattr(self, name)))
         node.serve(SetBool, '~/freeze', self._on_freeze)
