@@ -141,12 +141,20 @@ def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> B
     return _have_cells_below(_NARROW, corners_px, cells, blur_px)
 
 
-def are_fitted_whole(corners_px: FloatArray, cells: int, blur_px: float, *, displayed: bool) -> BoolArray:
-    """Which markers (N, 4, 2) are refined by their whole patterns: small ones, and larger ones on a display."""
-    return _have_cells_below(_NARROW_ON_DISPLAYS if displayed else _NARROW, corners_px, cells, blur_px)
+def are_fitted_whole(
+    corners_px: FloatArray, cells: int, blur_px: float, motion_px: FloatArray, *, displayed: bool
+) -> BoolArray:
+    """Which markers (N, 4, 2) are refined by their whole patterns: small ones, and larger ones on a display.
+
+    There their blur by motion ``motion_px`` (N,) counts as well: edges of a pattern that lag behind show together what
+    gain control makes of them.
+    """
+    if displayed:
+        return _have_cells_below(_NARROW_ON_DISPLAYS, corners_px, cells, np.hypot(blur_px, motion_px))
+    return _have_cells_below(_NARROW, corners_px, cells, blur_px)
 
 
-def _have_cells_below(blurs: float, corners_px: FloatArray, cells: int, blur_px: float) -> BoolArray:
+def _have_cells_below(blurs: float, corners_px: FloatArray, cells: int, blur_px: float | FloatArray) -> BoolArray:
     return np.asarray(widths(corners_px) < blurs * blur_px * cells)
 
 
