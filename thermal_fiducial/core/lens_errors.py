@@ -5,7 +5,7 @@ image (J. Quinonero-Candela, C. Rasmussen, "A Unifying View of Sparse Approximat
 Regression", JMLR 2005). Poses and maps from one camera have errors of the same draws, wherever these are needed.
 """
 
-from functools import cache
+from functools import cache, lru_cache
 from zlib import crc32
 
 import numpy as np
@@ -16,6 +16,8 @@ from thermal_fiducial.core.types import FloatArray
 
 #: Nodes are at most this many lengths of the process apart: between them its variance is known to 1 %.
 _NODES_APART = 1.0
+#: Number of cameras whose draws are kept.
+_CAMERAS = 16
 #: Least variance of a node that the others leave unexplained.
 _LEAST_INDEPENDENT = 1e-6
 
@@ -61,7 +63,7 @@ def _nodes(size: int, length: float) -> tuple[FloatArray, FloatArray]:
     return nodes, np.linalg.inv(np.linalg.cholesky(K)).T
 
 
-@cache
+@lru_cache(maxsize=_CAMERAS)
 def _variables(seed: int, modes: int) -> tuple[FloatArray, FloatArray]:
     """Variables (modes, 2, DRAWS) and (DRAWS,) of a camera, of variance one; uncorrelated as far as there are draws."""
     count = 2 * modes + 1

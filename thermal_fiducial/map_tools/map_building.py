@@ -21,6 +21,8 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 # Most passes over all frames: more than a chain of markers needs, each seen only together with the previous one.
 _MAX_PASSES = 50
+# Largest parameter ``keyframe_budget``: of more frames those are kept that are spread over the map.
+_MOST_KEYFRAMES = 20_000
 # Initial covariance of an alternative pose in its bundle adjustment: practically unknown.
 _UNKNOWN = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 
@@ -57,7 +59,8 @@ def build_map(
     frames : rows of MARKER_DTYPE of each frame
     progress : called with the number of markers in the map and the share of this pass that is done
     """
-    config = replace(config, mode='mapping', keyframe_budget=max(len(frames), config.keyframe_budget))
+    budget = min(max(len(frames), config.keyframe_budget), _MOST_KEYFRAMES)
+    config = replace(config, mode='mapping', keyframe_budget=budget)
     mapper = MarkerMapper(config, marker_map)
     refinement = None
     waiting: dict[int, str] = {}

@@ -29,6 +29,8 @@ _CARRIED_NS, _LONGEST_NS = 70_000_000, 150_000_000
 _LATE_NS = 87_000_000
 #: Factor on its variance by poses that contradict each other: a clock may have stepped.
 _DOUBT = 2.0
+# Ratio of determinants below which one pose is better than both together: two that are as good are averaged.
+_CLEARLY = 0.999
 
 
 class SecondClock:
@@ -165,13 +167,22 @@ def intersection(first: CameraPose, second: CameraPose) -> CameraPose | None:
     """Both poses of one instant as one, each with half its information; None where they contradict each other.
 
     Half of each bounds the covariance for any correlation of their errors (S. Julier, J. Uhlmann, "A non-divergent
-    estimation algorithm in the presence of unknown correlations", 1997), that of the map's errors in them, too.
+    estimation algorithm in the presence of unknown correlations", 1997), that of the map's errors in them, too. Where
+    one of them is better alone, it is that one.
     """
     if squared_distance(first, second) > CHI2_OF_POSE:
         return None
     apart = difference(second.T_map_camera, first.T_map_camera)
     informations = [0.5 * np.linalg.inv(pose.covariance) for pose in (first, second)]
     covariance = np.linalg.inv(informations[0] + informations[1])
+    better = min((first, second), key=lambda pose: float(np.linalg.det(pose.covariance)))
+    if np.linalg.det(better.covariance) < _CLEARLY * np.linalg.det(covariance):
+        return replace(
+            first,
+            T_map_camera=better.T_map_camera,
+            covariance=better.covariance,
+            map_covariance=better.map_covariance,
+        )
     gains = [covariance @ information for information in informations]
     bounds = [2.0 * G @ pose.map_covariance @ G.T for G, pose in zip(gains, (first, second), strict=True)]
     return replace(

@@ -55,6 +55,17 @@ def test_an_exact_pose_of_the_second_is_one_of_the_first():
     assert cameras.alone == 1
 
 
+def test_a_pose_that_is_far_better_alone_stays_alone():
+    """Ten times as good: with half of its information each, both together would be worse."""
+    poor, good = pose(0, np.eye(4), (9e-6,) * 6), pose(0, transform(np.eye(3), [1e-3, 0.0, 0.0]), (9e-8,) * 6)
+    for pair in ((poor, good), (good, poor)):
+        np.testing.assert_array_equal(intersection(*pair).covariance, good.covariance)
+        np.testing.assert_array_equal(intersection(*pair).T_map_camera, good.T_map_camera)
+    # Of two that are as good the mean, at the covariance of each.
+    both = intersection(poor, replace(poor, T_map_camera=good.T_map_camera))
+    np.testing.assert_allclose(both.T_map_camera[0, 3], 0.5e-3, rtol=1e-9)
+
+
 def test_the_covariance_follows_the_lever_arm():
     """Against numbers: the second camera's small errors, seen at the first."""
     T, T_there = T_BODY_SECOND, inverse(T_BODY_SECOND) @ T_BODY_FIRST
@@ -140,8 +151,8 @@ def test_a_pose_that_is_carried_by_an_uncertain_velocity_claims_it():
     vague = (1.0,) * 6
     cameras.add_second(second_pose(80 * MS, np.eye(4), (1e-8,) * 6), prior)
     joint = cameras.with_second(pose(100 * MS, T_BODY_FIRST, vague), prior)
-    # Half the information of each, the first's is nothing: twice (1 m/s x 20 ms)^2, and 2e-8 of the lever arm.
-    np.testing.assert_allclose(np.diag(joint.covariance)[:3], 2.0 * 0.02**2, rtol=2e-3)
+    # The first's says nothing beside it: (1 m/s x 20 ms)^2, and 1e-8 of the lever arm.
+    np.testing.assert_allclose(np.diag(joint.covariance)[:3], 0.02**2, rtol=2e-3)
 
 
 def test_each_pose_counts_once_and_an_old_one_not_at_all():
