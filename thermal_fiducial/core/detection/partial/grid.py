@@ -29,7 +29,15 @@ from thermal_fiducial.core.detection.corners.sides import (
     Sides,
 )
 from thermal_fiducial.core.detection.plates import outlines_on_faces
-from thermal_fiducial.core.detection.prediction.frame import counts_of, Frame, LEAST_DEPTH, Places, rolling_displacement
+from thermal_fiducial.core.detection.prediction.frame import (
+    counts_of,
+    Frame,
+    LEAST_DEPTH,
+    motion_blur,
+    Places,
+    removed_displacement,
+    rolling_displacement,
+)
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import retract
@@ -89,6 +97,8 @@ class Layer:
     #: standard deviation of the blur by optics and pixels [px], and motion blur (2,) along the motion [px]
     blur: float
     lag_blur: FloatArray
+    #: (1, 2, 3) map from pixels to their lag tails, which are removed; None: none are
+    to_tails: FloatArray | None = None
 
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (..., 2) of points (..., 3) in the camera frame, displaced by motion; NaN outside the lens model."""
@@ -129,7 +139,7 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer, thick
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, _COLUMNS, widest)
     blur = blur_of(sides, layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
-    measured = measure(counts_of(sides.pixel, layer.image), modelled, REACHED * blur.width, len(nodes))
+    measured = measure(counts_of(sides.pixel, layer.image, layer.to_tails), modelled, REACHED * blur.width, len(nodes))
     used = measured.variance[0] < UNMEASURED
     if used.sum() < 6:
         return None
@@ -190,24 +200,30 @@ def pose_jacobian(T: FloatArray, points: FloatArray, camera: Camera) -> FloatArr
 
 
 def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) -> Layer:
-    """The frame reduced by ``factor``, with the motion blur at a ``window`` (4, 3) in the camera frame."""
-    camera = _coarser(frame.camera, factor)
-    image, lag_blur = frame.image, np.zeros(2)
+    """The frame reduced by ``factor``, with the motion blur at a ``window`` (4, 3) in the camera frame.
+
+    At full resolution large lag tails are removed, as around whole markers: an edge with a tail, fitted as if its blur
+    were symmetric, seems a fifth of the blur ahead.
+    """
+    camera, image = _coarser(frame.camera, factor), frame.image
+    motion = motion_blur(frame, places_of_points(window, frame.camera), frame.twist)
+    to_tails, lag_blur = motion.to_tails, motion.spread[0]
     if factor > 1:
         cropped = image[: camera.height * factor, : camera.width * factor]
         image = np.asarray(cv2.resize(cropped, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
+        to_tails, lag_blur = None, (motion.shift + motion.removed)[0].mean(axis=0) / factor
     blur = math.hypot(blur_px / factor, math.sqrt((1.0 - 1.0 / factor**2) / 12.0))
-    if frame.twist is not None:
-        lag_blur = places_of_points(window, frame.camera).lag_blur(frame.twist, frame.lag)[0].mean(axis=0) / factor
 
     def displacement(points: FloatArray) -> FloatArray:
         if frame.twist is None:
             return np.zeros((len(points), 2))
         places = places_of_points(points, frame.camera)
         shift = places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
+        if to_tails is not None:
+            shift = shift - removed_displacement(places, frame.twist, frame)
         return np.asarray(shift[0] / factor)
 
-    return Layer(image, camera, displacement, blur, lag_blur)
+    return Layer(image, camera, displacement, blur, lag_blur, to_tails)
 
 
 def _coarser(camera: Camera, factor: int) -> Camera:

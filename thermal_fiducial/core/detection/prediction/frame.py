@@ -240,10 +240,16 @@ def motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlur
     mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
     if twist is None or (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
         return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
+    removed = removed_displacement(places, twist, frame)
+    shift = lag_blur - removed + rolling
+    to_tails = lag_tail_maps(places.at.px + shift, removed / (1.0 - REMAINING))
+    return MotionBlur(to_tails, shift, removed, SPREAD * mean)
+
+
+def removed_displacement(places: Places, twist: Twist, frame: Frame) -> FloatArray:
+    """Displacement (N, P, 2) by lag that vanishes with the lag tail [px]."""
     # Displacement of the image since its lag tail was recorded, stretched by the rolling shutter.
     tail = places.lag_blur(twist, frame.lag, LAG_TAIL_AGE)
     if frame.readout > 0.0:
         tail = tail * stretch(places, twist, frame)[..., None]
-    removed = (1.0 - REMAINING) * tail
-    shift = lag_blur - removed + rolling
-    return MotionBlur(lag_tail_maps(places.at.px + shift, tail), shift, removed, SPREAD * mean)
+    return (1.0 - REMAINING) * tail
