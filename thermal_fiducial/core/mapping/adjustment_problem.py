@@ -262,8 +262,9 @@ class MapProblem:
         weights = now.weights(scale)[:, None, None]
         of_camera, of_marker = (weights * np.swapaxes(J, -1, -2) for J in (now.J_camera, now.J_marker))
         odometry, known = self.odometry.weighted(now.camera_chi2), self.known.weighted(now.marker_chi2)
-        of_camera_by_odometry = odometry @ self._by_odometry(now)
-        of_odometry = np.swapaxes(self._by_odometry(now), -1, -2) @ of_camera_by_odometry
+        by_odometry = self._by_odometry(now)
+        of_camera_by_odometry = odometry @ by_odometry
+        of_odometry = np.swapaxes(by_odometry, -1, -2) @ of_camera_by_odometry
         blocks = Blocks(
             frame=self.over_frames(of_camera @ now.J_camera) + odometry,
             node=_with_odometry(self.over_markers(of_marker @ now.J_marker) + known, of_odometry),
