@@ -24,6 +24,8 @@ _OF_ROS = ('use_sim_time', 'start_type_description_service')
 QOS_OVERRIDES = 'qos_overrides.'
 #: 99.9 % quantile of chi square with six degrees of freedom, of a pose: beyond it two poses contradict each other.
 CHI2_OF_POSE = 22.5
+#: Largest ``keyframe_budget``.
+MOST_KEYFRAMES = 20_000
 
 
 def param(
@@ -598,7 +600,7 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
         maximum=60.0,
         dynamic=True,
     )
-    keyframe_budget: int = param(800, 'Most keyframes of the bundle adjustment.', minimum=10, maximum=20000)
+    keyframe_budget: int = param(800, 'Most keyframes of the bundle adjustment.', minimum=10, maximum=MOST_KEYFRAMES)
     autosave_period: float = param(
         30.0,
         'Period at which a changed map is written to <map_file>.autosave; 0: never.',

@@ -19,6 +19,8 @@ Gray: TypeAlias = npt.NDArray[np.uint8]
 SECOND_NS = 1_000_000_000
 #: Lower bound of divisors: far below all measured values, far above rounding.
 TINY = 1e-9
+#: Largest ID of a marker, version or revision of a map.
+LARGEST_ID = 2**31 - 1
 #: Standard deviation of normal variables over the median of their absolute values.
 SIGMA_OF_MEDIAN = 1.4826
 

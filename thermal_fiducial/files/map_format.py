@@ -14,6 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from thermal_fiducial.core.types import LARGEST_ID
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.schema import load_yaml, parse_yaml, Value
 
@@ -28,7 +29,6 @@ _NORM_TOLERANCE = 0.01
 # Tolerance of a covariance's symmetry and eigenvalues, relative to its largest element: rounding to six digits.
 _ROUNDING = 1e-6
 _MOST = 2**63 - 1
-_LARGEST_ID = 2**31 - 1
 _LARGEST_M = 1e5
 _SIMPLE = re.compile(r'[A-Za-z][A-Za-z0-9_./-]*')
 _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
@@ -93,19 +93,19 @@ def upgraded(path: str) -> str:
     fields = _head(root)
     if 'revision' in fields or 'version' not in fields:
         raise root.error('this map is of the present format already')
-    return dump_document(_filled(root, fields, fields['version'].integer(1, _LARGEST_ID)))
+    return dump_document(_filled(root, fields, fields['version'].integer(1, LARGEST_ID)))
 
 
 def _document(root: Value) -> MapDocument:
     fields = _head(root)
     version = fields.get('version')
-    number = VERSION if version is None else version.integer(0, _LARGEST_ID)
+    number = VERSION if version is None else version.integer(0, LARGEST_ID)
     if version is not None and number != VERSION:
         hint = ''
         if 'revision' not in fields:
             hint = '; if it was written before 0.2, which counted changes there: thermal-fiducial map upgrade'
         raise version.error(f'schema {number} is unknown, this release reads {VERSION}{hint}')
-    revision = fields['revision'].integer(0, _LARGEST_ID) if 'revision' in fields else 1
+    revision = fields['revision'].integer(0, LARGEST_ID) if 'revision' in fields else 1
     return _filled(root, fields, revision)
 
 
@@ -143,7 +143,7 @@ def _entry(value: Value) -> MarkerEntry:
         raise value.error('a marker without id')
     name, value.field = value.field, f'{value.field}: id'
     value.content['id'].field = value.field
-    marker_id = value.content['id'].integer(0, _LARGEST_ID)
+    marker_id = value.content['id'].integer(0, LARGEST_ID)
     value.field = f'{name} (marker {marker_id})'
     fields = value.mapping(_names(MarkerEntry))
     for needed in ('position', 'orientation'):

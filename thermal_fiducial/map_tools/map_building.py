@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.config import MarkerMapperConfig, MOST_KEYFRAMES
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import rotation_angle
@@ -21,8 +21,6 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 # Most passes over all frames: more than a chain of markers needs, each seen only together with the previous one.
 _MAX_PASSES = 50
-# Largest parameter ``keyframe_budget``: of more frames those are kept that are spread over the map.
-_MOST_KEYFRAMES = 20_000
 # Initial covariance of an alternative pose in its bundle adjustment: practically unknown.
 _UNKNOWN = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 
@@ -59,7 +57,7 @@ def build_map(
     frames : rows of MARKER_DTYPE of each frame
     progress : called with the number of markers in the map and the share of this pass that is done
     """
-    budget = min(max(len(frames), config.keyframe_budget), _MOST_KEYFRAMES)
+    budget = min(max(len(frames), config.keyframe_budget), MOST_KEYFRAMES)
     config = replace(config, mode='mapping', keyframe_budget=budget)
     mapper = MarkerMapper(config, marker_map)
     refinement = None

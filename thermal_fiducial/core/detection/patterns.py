@@ -18,8 +18,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 # Distance from a side at which black and white are compared: in cells, and at most in pixels.
 _OUTSIDE = 0.4
 _OUTSIDE_PX = 2.5
-# Largest number of rows that OpenCV interpolates at once.
-_MOST_ROWS = 2**15 - 2
+#: Largest number of rows, or of columns, of places that OpenCV interpolates at once.
+MOST_AT_ONCE = 2**15 - 2
 # Correlation below which the surroundings need not be measured.
 _SIMILAR = 0.5
 #: Samples along a cell, in its middle, away from blurred edges.
@@ -258,6 +258,6 @@ def sampled(image: Float32Array, places: Float32Array) -> Float32Array:
     """Values (Q, P) of the image at columns and rows (2, Q, P)."""
     parts = [
         cv2.remap(image, part[0], part[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for part in np.split(places, range(_MOST_ROWS, places.shape[1], _MOST_ROWS), axis=1)
+        for part in np.split(places, range(MOST_AT_ONCE, places.shape[1], MOST_AT_ONCE), axis=1)
     ]
     return np.asarray(parts[0] if len(parts) == 1 else np.concatenate(parts), dtype=np.float32)

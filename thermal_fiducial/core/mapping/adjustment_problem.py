@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -119,12 +120,16 @@ class Poses:
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals (n, 8) and Jacobians (n, 8, 6) of the n views at a state, whitened but not weighted."""
+    """Residuals (n, 8) and Jacobians (n, 8, 6) of the n views at a state, whitened but not weighted.
+
+    And how the keyframes' poses by odometry follow the pose of its frame, (F, 6, 6).
+    """
 
     state: Poses
     r: FloatArray
     J_camera: FloatArray
     J_marker: FloatArray
+    J_odometry: FloatArray
     chi2: FloatArray
     squared_px: FloatArray
     #: differences (F, 6) and (M, 6) from the state to the priors, and their chi squares (F,), (M,)
@@ -213,9 +218,10 @@ class MapProblem:
         chi2 = np.where(behind, BEHIND_CHI2, np.sum(r * r, axis=-1))
         J_camera, J_marker = ((self.W @ J.reshape(n, 4, 2, 6)).reshape(n, 8, 6) for J in (J_camera, J_marker))
         squared_px = np.sum(residuals**2, axis=(1, 2))
+        J_odometry = lever_arm(self.odometry.T[:, :3, 3] @ state.T_map_odometry[:3, :3].T)
         of_cameras = self.odometry.moved(state.T_map_odometry).apart(state.T_map_camera)
         of_markers = self.known.apart(state.T_map_marker)
-        return Linearised(state, r, J_camera, J_marker, chi2, squared_px, *of_cameras, *of_markers)
+        return Linearised(state, r, J_camera, J_marker, J_odometry, chi2, squared_px, *of_cameras, *of_markers)
 
     def step(self, now: Linearised, scale: float, damping: float) -> Linearised | None:
         """After one damped Gauss-Newton step; None where the equations are singular."""
@@ -245,7 +251,7 @@ class MapProblem:
         steps = np.linalg.solve(blocks.node + (TINY * largest + TINY) * np.eye(6), side)
         return replace(now.state, T_map_marker=retract(now.state.T_map_marker, steps[:-1, :, 0]))
 
-    @property
+    @cached_property
     def equations(self) -> NormalEquations:
         """Which keyframe is connected with which node: with markers by views, and with the frame of the odometry.
 
@@ -262,9 +268,8 @@ class MapProblem:
         weights = now.weights(scale)[:, None, None]
         of_camera, of_marker = (weights * np.swapaxes(J, -1, -2) for J in (now.J_camera, now.J_marker))
         odometry, known = self.odometry.weighted(now.camera_chi2), self.known.weighted(now.marker_chi2)
-        by_odometry = self._by_odometry(now)
-        of_camera_by_odometry = odometry @ by_odometry
-        of_odometry = np.swapaxes(by_odometry, -1, -2) @ of_camera_by_odometry
+        of_camera_by_odometry = odometry @ now.J_odometry
+        of_odometry = np.swapaxes(now.J_odometry, -1, -2) @ of_camera_by_odometry
         blocks = Blocks(
             frame=self.over_frames(of_camera @ now.J_camera) + odometry,
             node=_with_odometry(self.over_markers(of_marker @ now.J_marker) + known, of_odometry),
@@ -284,12 +289,8 @@ class MapProblem:
         of_odometry, of_known : (F, 6, k), (M, 6, k) information times differences from the priors
         """
         of_frames, of_markers = (np.swapaxes(J, -1, -2) @ of_views for J in (now.J_camera, now.J_marker))
-        back = -np.swapaxes(self._by_odometry(now), -1, -2) @ of_odometry
+        back = -np.swapaxes(now.J_odometry, -1, -2) @ of_odometry
         return self.over_frames(of_frames) + of_odometry, _with_odometry(self.over_markers(of_markers) + of_known, back)
-
-    def _by_odometry(self, now: Linearised) -> FloatArray:
-        """Derivatives (F, 6, 6) of the keyframes' poses by odometry by the pose of its frame."""
-        return lever_arm(self.odometry.T[:, :3, 3] @ now.state.T_map_odometry[:3, :3].T)
 
     def over_frames(self, values: FloatArray) -> FloatArray:
         """Sums (F, ...) of values (n, ...) of the views over those of each keyframe."""

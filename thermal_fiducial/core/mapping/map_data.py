@@ -24,8 +24,6 @@ _OUTLIER = 4.0
 # Residual that is never an outlier [m].
 _TOLERANCE_M = 0.01
 _REWEIGHTINGS = 4
-# Largest number of observations that a row can carry.
-_MOST_COUNTED = 2**32 - 1
 #: Weight of a new frame in what is known of a marker: a memory of 20 frames.
 MEMORY = 0.05
 
@@ -150,7 +148,8 @@ class MarkerMap:
         variances = np.stack([marker.covariance for marker in markers])[:, [0, 1, 2], [0, 1, 2]]
         rows['sigma_m'] = np.sqrt(np.maximum(np.mean(variances, axis=1), 0.0))
         rows['rms_px'] = [marker.reprojection_error_px for marker in markers]
-        rows['observations'] = [min(marker.observations, _MOST_COUNTED) for marker in markers]
+        most = int(np.iinfo(MAP_DTYPE['observations']).max)
+        rows['observations'] = [min(marker.observations, most) for marker in markers]
         for name in ('id', 'size', 'fixed', 'trusted'):
             rows[name] = [getattr(marker, name) for marker in markers]
         rows['in_view'] = [marker.id in in_view for marker in markers]

@@ -23,7 +23,7 @@ from thermal_fiducial.core.measurements import (
     MARKER_DTYPE,
     Markers,
 )
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, LARGEST_ID
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.messages import message_bytes
 from thermal_fiducial.ros.messages.convert import data_bytes, NORM_TOLERANCE, pose_of_row
@@ -43,8 +43,6 @@ _POINT_CODES = {code: datatype for datatype, code in _POINT_TYPES.items()}
 _MOST_ROWS = 20_000
 # (1e-4 px)^2, below what any corner detection achieves [px^2].
 _SMALLEST_CORNER_VARIANCE = 1e-8
-# Largest ID that a map file can hold.
-_LARGEST_ID = 2**31 - 1
 # Longest side of a marker [m].
 _LARGEST_MARKER = 100.0
 # Two uint32: height and width, or row_step and length of the data.
@@ -214,7 +212,7 @@ def _checked(rows: Markers) -> Markers:
     # A marker without a pose has NaN there.
     if (np.abs(columns(rows, _POSE_FIELDS)) > LARGEST_COORDINATE).any():
         raise InputError('markers with poses beyond all bounds')
-    if rows['id'].max(initial=0) > _LARGEST_ID:
+    if rows['id'].max(initial=0) > LARGEST_ID:
         raise InputError(f'marker {rows["id"].max()}, beyond any dictionary')
     return rows
 

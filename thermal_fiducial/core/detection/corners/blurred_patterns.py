@@ -19,6 +19,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from thermal_fiducial.core.detection.patterns import MOST_AT_ONCE
 from thermal_fiducial.core.detection.prediction.frame import without_tails
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
@@ -38,8 +39,6 @@ UNEVEN_AMOUNTS = slice(LINEAR.start + UNEVEN.start, LINEAR.start + UNEVEN.stop)
 UNEVEN_AT_CORNERS = np.array([0.5, 0.25, 0.25, 0.25])
 # Places among the linear terms of the gradients of the contrast, of the bowl, and of what gain control adds.
 _GRADIENTS, _BOWL, _OF_GAIN_CONTROL = slice(1, 3), UNEVEN.start, slice(UNEVEN.stop, None)
-# Longest row of places that OpenCV interpolates at once.
-_LONGEST_ROW = 2**15 - 1
 # Cumulative standard normal distribution, by a table.
 _FARTHEST = 6.0
 _Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
@@ -132,7 +131,7 @@ class PatternView(NamedTuple):
 
     def _at(self, places: Float32Array) -> Float32Array:
         samples = places.shape[2]
-        u, v = places.reshape(2, -1, samples if samples < _LONGEST_ROW else math.isqrt(samples))
+        u, v = places.reshape(2, -1, samples if samples <= MOST_AT_ONCE else math.isqrt(samples))
         shown = cv2.remap(self.image, u, v, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(shown, dtype=np.float32).reshape(places.shape[1:])
 
