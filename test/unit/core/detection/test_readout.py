@@ -8,6 +8,7 @@ import pytest
 from thermal_fiducial.core.detection.prediction.frame import (
     delays,
     Frame,
+    motion_blur,
     Places,
     rolling_displacement,
     stretch,
@@ -81,3 +82,12 @@ def test_what_runs_with_the_read_out_leaves_longer_ways(speed):
     rate = FRAME.readout / 511 * (places.flow @ falling.value)[..., 1]
     np.testing.assert_allclose(stretch(places, falling, FRAME), 1.0 / (1.0 - rate), rtol=1e-12)
     assert np.all((stretch(places, falling, FRAME) > 1.0) == (speed > 0.0))
+
+
+@pytest.mark.parametrize('lag', [0.0005, 0.010])
+def test_rows_that_are_read_later_are_displaced_and_no_more_blurred(lag):
+    """By a little lag, of which nothing is removed, and by much, whose tails are."""
+    places = places_of(points())
+    motion = motion_blur(replace(FRAME, lag=lag), places, TWIST)
+    assert (motion.to_tails is None) == (lag < 0.001)
+    np.testing.assert_allclose(motion.lag, places.lag_blur(TWIST, lag).mean(axis=1), rtol=1e-12, atol=1e-12)

@@ -142,15 +142,16 @@ def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> B
 
 
 def are_fitted_whole(
-    corners_px: FloatArray, cells: int, blur_px: float, motion_px: FloatArray, *, displayed: bool
+    corners_px: FloatArray, cells: int, blur_px: float, lag: FloatArray, *, displayed: bool
 ) -> BoolArray:
     """Which markers (N, 4, 2) are refined by their whole patterns: small ones, and larger ones on a display.
 
-    There their blur by motion ``motion_px`` (N,) counts as well: edges of a pattern that lag behind show together what
-    gain control makes of them.
+    There their blur by ``lag`` (N, 2) [px] counts as well: edges of a pattern that lag behind show together what gain
+    control makes of them.
     """
     if displayed:
-        return _have_cells_below(_NARROW_ON_DISPLAYS, corners_px, cells, np.hypot(blur_px, motion_px))
+        blurs_px = np.hypot(blur_px, np.hypot(*lag.T))
+        return _have_cells_below(_NARROW_ON_DISPLAYS, corners_px, cells, blurs_px)
     return _have_cells_below(_NARROW, corners_px, cells, blur_px)
 
 

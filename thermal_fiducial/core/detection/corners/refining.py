@@ -90,8 +90,7 @@ def refine(
     for _ in range(_ROUNDS):
         blur = motion_blur(frame, places, twist)
         start = places.at.at_pixels(places.at.px + blur.shift)
-        lag_px = np.linalg.norm((blur.shift + blur.removed).mean(axis=1), axis=-1)
-        by_pattern = are_fitted_whole(start.px, decoder.cells, config.blur_px, lag_px, displayed=frame.displayed)
+        by_pattern = are_fitted_whole(start.px, decoder.cells, config.blur_px, blur.lag, displayed=frame.displayed)
         if by_pattern.any():
             refined = _with_patterns(frame, found, start, blur, behind, columns, by_pattern, decoder, config)
         else:

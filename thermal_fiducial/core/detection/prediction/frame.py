@@ -227,6 +227,11 @@ class MotionBlur(Stacked):
     #: (N, 2) standard deviation of the remaining motion blur, along the motion [px]
     spread: FloatArray
 
+    @property
+    def lag(self) -> FloatArray:
+        """Blur by lag (N, 2) as the image has it, tails and all: its mean and its standard deviation [px]."""
+        return self.spread if self.to_tails is None else self.spread / SPREAD
+
     @staticmethod
     def none(count: int) -> 'MotionBlur':
         """Of ``count`` markers at rest."""
