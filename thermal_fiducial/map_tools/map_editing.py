@@ -85,8 +85,8 @@ def transformed(marker_map: MarkerMap, T_new_old: FloatArray) -> MarkerMap:
 def merge(resting: MarkerMap, moving: MarkerMap) -> tuple[MarkerMap, Alignment]:
     """Both maps in the frame of ``resting``.
 
-    Common markers keep the pose with the smaller covariance. The others of ``moving`` are added, their covariance
-    inflated by the misfit of the common ones.
+    The covariances of ``moving`` are inflated by the misfit of the common markers. Of these the pose with the smaller
+    covariance is kept; the others of ``moving`` are added.
 
     Raises
     ------
@@ -102,14 +102,14 @@ def merge(resting: MarkerMap, moving: MarkerMap) -> tuple[MarkerMap, Alignment]:
     changes: dict[int, MapMarker] = {}
     for key, marker in moved.items():
         own = resting.markers.get(key)
+        arm = lever_arm(marker.T_map_marker[:3, 3] - middle)
+        placed = replace(marker, fixed=False, covariance=marker.covariance + arm @ slack @ arm.T)
         if own is None:
-            arm = lever_arm(marker.T_map_marker[:3, 3] - middle)
-            changes[key] = replace(marker, fixed=False, covariance=marker.covariance + arm @ slack @ arm.T)
+            changes[key] = placed
         elif key not in alignment.outliers and not own.fixed:
-            better = marker if np.trace(marker.covariance) < np.trace(own.covariance) and marker.trusted else own
+            better = placed if np.trace(placed.covariance) < np.trace(own.covariance) and placed.trusted else own
             changes[key] = replace(
                 better,
-                fixed=False,
                 observations=own.observations + marker.observations,
                 first_seen_ns=min((seen for seen in (own.first_seen_ns, marker.first_seen_ns) if seen), default=0),
                 last_seen_ns=max(own.last_seen_ns, marker.last_seen_ns),

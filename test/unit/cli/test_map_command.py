@@ -199,6 +199,22 @@ def test_a_merged_marker_claims_what_the_common_ones_leave_open(common):
     assert 0.4 < np.mean(squares) / 6.0 < 1.5
 
 
+@pytest.mark.parametrize('common', [1, 3])
+def test_a_common_marker_is_known_no_better_than_the_frame_it_is_merged_into(common):
+    """Surveyed to 20 mm in the map that stays, and known exactly in the one that is added."""
+    poses, stds = wall(np.random.default_rng(0)), np.repeat((0.02, 0.03), 3)
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        off = {key: retract(poses[key], stds * rng.normal(size=6)) for key in range(common)}
+        coarse = MarkerMap({key: MapMarker(key, SIZE, False, off[key], np.diag(stds**2)) for key in off})
+        precise = MarkerMap({key: MapMarker(key, SIZE, True, poses[key]) for key in off})
+        for key, marker in merge(coarse, precise)[0].markers.items():
+            d = difference(marker.T_map_marker, poses[key])
+            squares.append(d @ np.linalg.solve(marker.covariance, d))
+    assert 0.4 < np.mean(squares) / 6.0 < 1.5
+
+
 def test_markers_in_quarantine_align_no_maps():
     poses = wall(np.random.default_rng(0))
     maps = [MarkerMap({key: MapMarker(key, SIZE, key == 0, poses[key]) for key in ids}) for ids in ((0, 1), (0, 1, 3))]
