@@ -207,7 +207,7 @@ def expect(
     bits: int = 4,
     seed: int = 1,
 ) -> Expectation:
-    """Prediction for a marker in the middle of the image of ``camera``.
+    """Prediction for a marker in the middle of the image of ``camera``, which counts as found with all corners in view.
 
     Parameters
     ----------
@@ -222,8 +222,10 @@ def expect(
     side_px = camera.focal_px * size / distance
     rng = np.random.default_rng(seed)
     T = viewed_at(distance, np.radians(tilt_deg), rng.uniform(0.0, 2.0 * np.pi, _SAMPLES), camera)
-    narrow_px = narrow_sides(camera.project(se3.apply(T, marker_corners(size))))
-    found = measurements.found_share(narrow_px, contrast, tilt_deg, bits)
+    corners = camera.project(se3.apply(T, marker_corners(size)))
+    narrow_px = narrow_sides(corners)
+    in_image = np.all((corners >= 0.0) & (corners <= (camera.width - 1, camera.height - 1)), axis=(1, 2))
+    found = np.where(in_image, measurements.found_share(narrow_px, contrast, tilt_deg, bits), 0.0)
     share = float(found.mean())
     if share == 0.0:
         return Expectation(side_px, share)

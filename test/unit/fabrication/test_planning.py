@@ -129,6 +129,12 @@ def test_clear_markers_at_12_m_are_not_measured_too_far_away():
     assert show(detector, camera, 19.1, 11.0, 30.0, 48, [99, 19]).distance_error < 0.0012
 
 
+@pytest.mark.parametrize(('side', 'promised'), [(350.0, (1.0, 1.0)), (450.0, (0.1, 0.5)), (520.0, (0.0, 0.0))])
+def test_markers_that_reach_out_of_the_image_are_not_found(side, promised):
+    """In an image of 512 rows a square of 450 px fits in some rotations only, one of 350 px in all."""
+    assert promised[0] <= view(table(1.0, 0.02), side, 50.0, 0.0).found <= promised[1]
+
+
 def test_a_marker_as_large_and_bright_as_this_is_always_found():
     """One of twelve was lost where a plate's border, read inside out as another marker, stood for the place."""
     camera, detector = camera_and_detector()
