@@ -114,7 +114,8 @@ def text_lines(path: str | Path, limit: int) -> Iterator[tuple[int, str]]:
             if len(data) > LINE_LIMIT_BYTES:
                 raise InputError(f'{path}: line {number} is longer than {LINE_LIMIT_BYTES} bytes')
             try:
-                line = data.decode('utf-8').strip()
+                # Spreadsheets begin a file with a byte order mark.
+                line = data.decode('utf-8-sig').strip()
             except UnicodeDecodeError:
                 raise InputError(f'{path}: line {number} is not text') from None
             if line:

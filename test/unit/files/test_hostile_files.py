@@ -271,6 +271,16 @@ def test_tables_that_are_none(tmp_path, table, kind):
     assert str(path) in refused(TABLES[table], path)
 
 
+def test_tables_of_a_spreadsheet(tmp_path):
+    """They begin with a byte order mark, and lines end with both characters."""
+    path = tmp_path / 'table.csv'
+    path.write_bytes('\ufeffstamp_ns,id\r\n1,2\r\n'.encode())
+    assert list(named_rows(path, ('stamp_ns', 'id'))) == [(2, ['1', '2'])]
+    assert list(csv_rows(path)) == [(1, ['stamp_ns', 'id']), (2, ['1', '2'])]
+    path.write_bytes('\ufeff1.5 1 2 3 0 0 0 1\r\n'.encode())
+    assert load_tum(path)[0].tolist() == [1_500_000_000]
+
+
 @pytest.mark.parametrize('kind', ['a pipe', 'a device', 'nothing but holes'])
 @pytest.mark.parametrize('suffix', ['.mcap', '.db3', '.bag'])
 @pytest.mark.parametrize('in_folder', [False, True])
