@@ -18,14 +18,14 @@ import numpy as np
 import numpy.typing as npt
 
 from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE
-from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import csv_rows
 from thermal_fiducial.files.images import read_picture
 from thermal_fiducial.files.records import is_imu_reading
-from thermal_fiducial.files.rig_files import densities, of_camchain, of_rig, of_sensor, Rig
+from thermal_fiducial.files.rig_files import body_sensor, densities, of_camchain, of_rig, of_sensor, Rig
 from thermal_fiducial.files.trajectory_file import load_tum
 
 #: Limit of marker IDs, above any dictionary; deviation of a quaternion's norm from 1, as in maps.
@@ -136,13 +136,20 @@ def _asl(folder: Path, camera: str) -> Recording:
         Picture(_stamp(f'{folder / camera / "data.csv"} line {number}', words[0]), folder / camera / 'data' / words[1])
         for number, words in _lines(folder / camera / 'data.csv', 2)
     ]
-    truth = None
-    reference = folder / 'state_groundtruth_estimate0' / 'data.csv'
-    if reference.exists():
-        # Position, then the quaternion with w first.
-        stamps, values = _table(reference, 8)
-        truth = stamps, transform_from_quaternion(values[:, :3], values[:, [4, 5, 6, 3]])
-    return Recording(rig, _samples(folder / 'imu0' / 'data.csv'), pictures=pictures, truth=truth)
+    samples = _samples(folder / 'imu0' / 'data.csv')
+    reference = folder / 'state_groundtruth_estimate0'
+    truth = _asl_truth(reference, folder / 'imu0') if (reference / 'data.csv').exists() else None
+    return Recording(rig, samples, pictures=pictures, truth=truth)
+
+
+def _asl_truth(reference: Path, imu: Path) -> tuple[IntArray, FloatArray]:
+    """Stamps [ns] and poses (N, 4, 4) of the IMU, from those of a sensor in the folder ``reference``."""
+    # Position, then the quaternion with w first.
+    stamps, values = _table(reference / 'data.csv', 8, _is_pose)
+    T_map_sensor = transform_from_quaternion(values[:, :3], values[:, [4, 5, 6, 3]])
+    place = reference / 'sensor.yaml'
+    T_body_sensor = body_sensor(place) if place.exists() else np.eye(4)
+    return stamps, T_map_sensor @ inverse(T_body_sensor) @ body_sensor(imu / 'sensor.yaml')
 
 
 def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) -> Recording:

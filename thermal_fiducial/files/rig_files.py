@@ -83,9 +83,19 @@ def of_sensor(camera: Path, imu: Path) -> Rig:
     """
     entry, other = _document(camera), _document(imu)
     lens = _lens(entry, *_resolution(entry), _pinhole(entry), 'distortion_model', 'distortion_coefficients')
-    T_body_camera, T_body_imu = (_rigid(_needed(_needed(sensor, 'T_BS'), 'data')) for sensor in (entry, other))
     # ASL's names of the noise densities are those of Kalibr.
-    return Rig(lens, inverse(T_body_imu) @ T_body_camera, _noise(other))
+    return Rig(lens, inverse(body_sensor(imu)) @ body_sensor(camera), _noise(other))
+
+
+def body_sensor(path: Path) -> FloatArray:
+    """``T_BS`` (4, 4) of EuRoC's ``sensor.yaml``.
+
+    Raises
+    ------
+    InputError
+        Missing or no rigid transform.
+    """
+    return _rigid(_needed(_needed(_document(path), 'T_BS'), 'data'))
 
 
 def of_camchain(path: Path, camera: str, noise: Mapping[str, float]) -> Rig:

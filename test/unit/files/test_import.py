@@ -122,7 +122,9 @@ def test_stamps_that_go_back_stay_in_the_bag(ours):
 PICTURE = np.arange(512 * 640, dtype=np.uint16).reshape(512, 640)
 
 
-def test_euroc(tmp_path):
+@pytest.fixture
+def euroc(tmp_path):
+    """A folder of EuRoC's layout."""
     place = tmp_path / 'flight' / 'mav0'
     imu_csv(place / 'imu0' / 'data.csv', '#timestamp [ns],w_RS_S_x [rad s^-1],...')
     T_body_imu = transform(np.eye(3), [0.5, 0.0, 0.0])
@@ -139,14 +141,27 @@ def test_euroc(tmp_path):
         cv2.imwrite(str(place / 'cam1' / 'data' / f'{stamp}.png'), PICTURE)
     (place / 'state_groundtruth_estimate0').mkdir()
     (place / 'state_groundtruth_estimate0' / 'data.csv').write_text(f'#t\n{FRAMES[0]},1,2,3,0.5,0.5,-0.5,0.5,0,0,0\n')
-    assert run(tmp_path / 'flight') == 0
+    return tmp_path / 'flight'
+
+
+def test_euroc(tmp_path, euroc):
+    assert run(euroc) == 0
     found = contents(tmp_path / 'bag')
     np.testing.assert_array_equal(image_to_array(found[IMAGE_TOPIC][2][1]), PICTURE)
     assert found[CAMERA_INFO_TOPIC][0][1].k[4] == 746.0
     orientation = found[TRUTH_TOPIC][0][1].pose.pose.orientation
     assert (orientation.w, orientation.x, orientation.y, orientation.z) == (0.5, 0.5, -0.5, 0.5)
+    # The IMU is half a metre beside the body, along its x axis.
+    place = found[TRUTH_TOPIC][0][1].pose.pose.position
+    np.testing.assert_allclose([place.x, place.y, place.z], [1.0, 2.0, 3.5], atol=1e-12)
     # The pose of the camera in the frame of the IMU, wherever the body's is.
     np.testing.assert_allclose(parameters(tmp_path / 'bag')['camera_position'], [0.1, -0.02, 0.03], atol=1e-12)
+
+
+def test_a_ground_truth_without_attitude_is_refused(euroc, capsys):
+    corrupt(euroc / 'mav0' / 'state_groundtruth_estimate0' / 'data.csv', lambda text: re.sub('-?0.5', '0', text))
+    assert run(euroc) == 2
+    assert 'data.csv line 2: numbers, but none that were measured' in capsys.readouterr().err
 
 
 def test_kalibr(tmp_path):
