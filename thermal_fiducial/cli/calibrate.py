@@ -150,11 +150,12 @@ def _recorded_rows(bag: BagReader) -> Iterator[tuple[int, Markers]]:
 
 
 def _mapped_corners(found: Iterable[tuple[int, Markers]], marker_map: MarkerMap) -> Iterator['FrameCorners']:
-    """Detections of mapped markers, frames without any left out."""
+    """Detections of mapped markers that are not in quarantine, frames without any left out."""
     from thermal_fiducial.calibration.rolling import FrameCorners
 
+    trusted = [key for key, marker in marker_map.markers.items() if marker.trusted]
     for stamp_ns, rows in found:
-        rows = rows[np.isin(rows['id'], list(marker_map.markers))]
+        rows = rows[np.isin(rows['id'], trusted)]
         if len(rows) == 0:
             continue
         markers = [marker_map.markers[marker_id] for marker_id in rows['id'].tolist()]

@@ -1,5 +1,7 @@
 """``calibrate`` on bags: reading, choosing views, refusing."""
 
+from dataclasses import replace
+
 from builtin_interfaces.msg import Time
 import cv2
 import numpy as np
@@ -28,7 +30,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera, save_camera
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
-from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.ros.messages.clouds import MARKER_CLOUDS
 from thermal_fiducial.sim.lens import Lens
 
@@ -82,6 +84,18 @@ def test_camera_against_imu_by_recorded_corners(tmp_path):
     marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
     bag = with_corners_instead_of_images(recording(seconds=4.2), marker_map).write(tmp_path / 'bag')
     calibrated(bag, marker_map, tmp_path / 'extrinsics.yaml')
+
+
+def test_camera_against_imu_leaves_out_markers_in_quarantine(tmp_path):
+    marker_map, _ = side_files(tmp_path, ids=(0, 1, 2))
+    bag = with_corners_instead_of_images(recording(seconds=4.2), marker_map).write(tmp_path / 'bag')
+    known, found = load_map(marker_map), []
+    moved = se3.transform(np.eye(3), [0.0, 0.3, 0.0]) @ known.markers[2].T_map_marker
+    quarantined = replace(known.markers[2], T_map_marker=moved, trusted=False)
+    for others in ({}, {2: quarantined}):
+        save_map(marker_map, replace(known, markers={key: known.markers[key] for key in (0, 1)} | others))
+        found.append(calibrated(bag, marker_map, tmp_path / 'extrinsics.yaml'))
+    assert found[0] == found[1]
 
 
 def test_camera_against_imu_names_the_dictionary_that_no_frame_shows(tmp_path, capsys):
