@@ -1,6 +1,6 @@
 """A map from frames in any order: photos of a site, or the detections of a whole run."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -73,8 +73,9 @@ def build_map(
             break
     unplaced = {key: why for key, why in waiting.items() if key not in mapper.map.markers}
     unused, errors = _residuals(mapper.map, frames, camera, config)
-    final = _with_statistics(mapper.map, frames, marker_map, errors)
-    return Built(final, refinement, unplaced, len(frames) - len(unused), unused)
+    used = [rows for k, rows in enumerate(frames) if k not in unused]
+    final = _with_statistics(mapper.map, used, marker_map, errors)
+    return Built(final, refinement, unplaced, len(used), unused)
 
 
 def _stamp(k: int) -> int:
@@ -142,14 +143,13 @@ def _with_statistics(
     built: MarkerMap, frames: Sequence[Markers], start: MarkerMap, errors: Mapping[int, float]
 ) -> MarkerMap:
     """The map with its final errors, observations counted once in spite of several passes, and no artificial stamps."""
-    ids, counts = np.unique(np.concatenate([rows['id'] for rows in frames]), return_counts=True)
-    seen = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    seen = Counter(key for rows in frames for key in rows['id'].tolist())
     for key, marker in built.markers.items():
         earlier = start.markers.get(key)
         built.markers[key] = replace(
             marker,
             reprojection_error_px=errors.get(key, marker.reprojection_error_px),
-            observations=seen.get(key, 0) + (earlier.observations if earlier else 0),
+            observations=seen[key] + (earlier.observations if earlier else 0),
             first_seen_ns=earlier.first_seen_ns if earlier else 0,
             last_seen_ns=earlier.last_seen_ns if earlier else 0,
         )

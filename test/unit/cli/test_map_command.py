@@ -258,6 +258,20 @@ def test_refine_counts_the_frames_that_gave_nothing_by_reason(path, poses, photo
     assert '30 of 32 frames used\n2 not used: no known marker in view\n' in capsys.readouterr().out
 
 
+def test_refine_counts_no_views_of_frames_without_a_pose(path, poses, photographed):
+    """In two more frames the corners run the other way round, as no camera sees them."""
+    save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
+    lines = photographed[0].read_text().splitlines()
+    u0, v0, u1, v1, u2, v2, u3, v3, sigma = next(line for line in lines if line.split(',')[1] == '0').split(',')[2:]
+    mirrored = f'0,{u0},{v0},{u3},{v3},{u2},{v2},{u1},{v1},{sigma}'
+    counts = []
+    for more in ([], [f'{stamp(k)},{mirrored}' for k in (400, 500)]):
+        photographed[0].write_text('\n'.join([*lines, *more]))
+        assert run('--marker-size', SIZE, 'refine', path, *photographed, '--out', path.with_name('refined.yaml')) == 0
+        counts.append(load_map(path.with_name('refined.yaml')).markers[0].observations)
+    assert counts[0] == counts[1] > 0
+
+
 def test_refine_takes_detections_in_any_order(path, poses, photographed, capsys):
     """Sorted by marker, as a spreadsheet leaves them."""
     save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
