@@ -67,6 +67,17 @@ def test_runs_and_a_joint_map(alone):
     assert (alone / 'flight1' / 'fused.tum').read_text()
 
 
+def test_the_joint_map_starts_with_the_sides_of_the_parameters(tmp_path):
+    """A map file need not say how large its markers are."""
+    small_bag.recording(seconds=0.5).write(tmp_path / 'flight0')
+    marker_map, parameters = small_bag.side_files(tmp_path)
+    marker_map.write_text(marker_map.read_text().replace(f'size: {small_bag.SIZE}, ', ''))
+    side = f'marker_size: 0.1, marker_size_overrides: ["0:{small_bag.SIZE}"]'
+    parameters.write_text(f'/**: {{ros__parameters: {{{side}}}}}')
+    assert batch(tmp_path, 'out', bags=['flight0']) == 0
+    assert load_map(tmp_path / 'out' / 'marker_map.yaml').markers[0].size == small_bag.SIZE
+
+
 def test_the_calibration_of_a_bag_is_read_once(folder, monkeypatch):
     read = []
 

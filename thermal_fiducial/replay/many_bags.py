@@ -16,6 +16,7 @@ import numpy as np
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
+from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import Markers
 from thermal_fiducial.errors import InputError, RunError
@@ -240,7 +241,8 @@ def _put_back(unfinished: Path, run: Path) -> None:
 
 def _joint_map(batch: Batch, runs: Sequence[Options], camera: Camera) -> tuple[Built, int]:
     config = replace(read_settings(batch.options.params, {}).marker_mapper, mode='mapping')
-    start = load_map(Path(str(batch.options.map_file)), config.marker_size)
+    sizes = size_overrides(config.marker_size_overrides)
+    start = load_map(Path(str(batch.options.map_file)), config.marker_size, sizes)
     share = max(batch.max_frames // len(runs), 1)
     frames = [rows for run in runs for rows in _frames(run, share)]
     if not frames:
