@@ -27,6 +27,8 @@ NO_SCALES: FloatArray = np.zeros((6, 2))
 SAME_POSE = np.deg2rad(2.0)
 # A corner that moves faster in the image than this is hardly before the camera at all [px/m, px/rad].
 _STEEPEST = 1e6
+# A corner whose place in the image is known worse than this is known nowhere; a covariance with it has no root [px^2].
+_WIDEST = 1e12
 # How often a fit may change its mind about the cameras' poses.
 _CHOICES = 4
 
@@ -215,8 +217,9 @@ class MarkerViews:
         r, J_camera, _ = self._linearised(T, self._T_map_camera[own])
         possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(-1, -2))
         J_sound = np.where(possible[..., None, None], J_camera, 0.0)
-        C = J_sound @ self._covariances[own] @ np.swapaxes(J_sound, -1, -2) + self._uncertain
-        L = np.linalg.cholesky(C)
+        moved = J_sound @ self._covariances[own] @ np.swapaxes(J_sound, -1, -2)
+        possible &= np.all(np.einsum('...ii->...i', moved) < _WIDEST, axis=-1)
+        L = np.linalg.cholesky(np.where(possible[..., None, None], moved, 0.0) + self._uncertain)
         log_determinants = 2.0 * np.sum(np.log(np.einsum('...ii->...i', L)), axis=-1)
         constants = np.where(possible, log_determinants, np.inf) + self._chi2_of_cameras[own]
         W = np.linalg.inv(L)

@@ -27,14 +27,15 @@ def view(stamp_ns, T_map_camera, covariance=1e-3):
     return MarkerView(stamp_ns, viewpoint, corners, np.tile(1e-4 * np.eye(2), (4, 1, 1)), np.stack([branch] * 2))
 
 
+@pytest.mark.parametrize('covariance', [1e-3, 1e5])
 @pytest.mark.parametrize('gap', [0.0, 1e-12, 1e-9, 1e-6, 1e-3])
-def test_a_start_through_a_camera_is_no_marker(gap):
+def test_a_start_through_a_camera_is_no_marker(gap, covariance):
     """The camera of one view stands in the corner where another view has the marker: it cannot have seen it."""
     corner = T_MAP_MARKER[:3, :3] @ marker_corners(SIZE)[0] + T_MAP_MARKER[:3, 3]
     turned = so3_exp([0.1, 0.0, 0.0])
     candidate = Candidate(7, SIZE)
     candidate.add(view(0, transform(np.eye(3), [0.1, 0.2, 0.0])))
-    candidate.add(view(1, transform(turned, corner - turned @ [1e-3, 2e-3, gap])))
+    candidate.add(view(1, transform(turned, corner - turned @ [1e-3, 2e-3, gap]), covariance))
     candidate.add(view(2, transform(so3_exp([-0.1, 0.0, 0.0]), [2.0, 2.0, 0.0])))
     reason = candidate.place(CAMERA, SystematicErrors())
     assert isinstance(reason, str)
