@@ -261,6 +261,8 @@ def _survey(path: Path) -> dict[int, FloatArray]:
             raise InputError(f'{path}: line {number} is not "id,x,y,z"') from None
         if not np.all(np.abs(centre) < LARGEST_COORDINATE):
             raise InputError(f'{path}: line {number} is not a place [m]')
+        if int(row[0]) in surveyed:
+            raise InputError(f'{path}: line {number}: marker {row[0]} for the second time')
         surveyed[int(row[0])] = centre
     return surveyed
 

@@ -175,6 +175,14 @@ def test_anchor_moves_the_map_onto_a_survey(path, poses):
     assert run('anchor', path, survey) == 2
 
 
+def test_a_survey_that_has_a_marker_twice_is_refused(path, capsys):
+    survey, before = path.with_name('survey.csv'), path.read_bytes()
+    survey.write_text('0,0,0,1\n3,1,0,1\n5,0,1,1\n0,0,5,1\n')
+    assert run('anchor', path, survey) == 2
+    assert 'survey.csv: line 4: marker 0 for the second time' in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
 @pytest.mark.parametrize('common', [1, 3])
 def test_a_merged_marker_claims_what_the_common_ones_leave_open(common):
     """Ten metres beside them: what they are turned by moves it most."""
