@@ -266,6 +266,17 @@ def test_refine_counts_the_frames_that_gave_nothing_by_reason(path, poses, photo
     assert '30 of 32 frames used\n2 not used: no known marker in view\n' in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(('column', 'value'), [(1, '0.5'), (10, '0'), (10, '-1'), (10, '1e12')])
+def test_refine_refuses_ids_and_errors_that_no_marker_has(path, poses, photographed, capsys, column, value):
+    save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
+    head, first, *others = photographed[0].read_text().splitlines()
+    cells = first.split(',')
+    cells[column] = value
+    photographed[0].write_text('\n'.join([head, ','.join(cells), *others]))
+    assert run('--marker-size', SIZE, 'refine', path, *photographed) == 2
+    assert 'detections.csv: line 2: not a detection' in capsys.readouterr().err
+
+
 def test_refine_counts_no_views_of_frames_without_a_pose(path, poses, photographed):
     """In two more frames the corners run the other way round, as no camera sees them."""
     save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
