@@ -171,11 +171,11 @@ def _statistics(metric: Any, truth: PoseTrajectory3D, estimate: PoseTrajectory3D
     return {name: scale * float(value) for name, value in metric.get_all_statistics().items() if name in _STATISTICS}
 
 
-def _at(numbers: dict[str, Any], keys: Sequence[str]) -> float | None:
+def _at(numbers: dict[str, Any], keys: Sequence[str]) -> Any:
     value: Any = numbers
     for key in keys:
         value = value.get(key) if isinstance(value, dict) else None
-    return None if value is None else float(value)
+    return value
 
 
 def _charts(comparison: Comparison) -> list[Any]:

@@ -1,5 +1,6 @@
 """Runs side by side: the numbers are evo's, and agree with ours where truth has the same stamps."""
 
+from dataclasses import replace
 import json
 
 import pytest
@@ -73,6 +74,14 @@ def test_the_page_and_the_tables(runs, tmp_path, capsys, monkeypatch):
     assert json.loads(capsys.readouterr().out).keys() == {'a', 'b'}
     assert main(['evaluate', *map(str, runs), '--compare', '--json', '--out', str(page)]) == 0
     assert json.loads(capsys.readouterr().out).keys() == {'a', 'b'}
+
+
+def test_counts_have_no_decimals(comparison):
+    counted = {
+        name: values | {'innovations': {'poses': 90, 'refused': 16}} for name, values in comparison.numbers.items()
+    }
+    of_filter = replace(comparison, numbers=counted).tables[-1]
+    assert ('of these, refused', 'count', '16', '16') in of_filter.rows
 
 
 @pytest.mark.parametrize(
