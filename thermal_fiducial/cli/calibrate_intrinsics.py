@@ -14,6 +14,7 @@ from thermal_fiducial.calibration.report import BoardView, write_report
 from thermal_fiducial.calibration.sources import is_folder_of_pictures, measured_points
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
 from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures
+from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.ranges import BOARD_MM, BOARD_POINTS, FOCAL_PX, IMAGE_PX, MORE_POINTS
 from thermal_fiducial.cli.subcommands import add_remap, file_to_write, whole_number
@@ -59,6 +60,7 @@ def add_arguments(parser: Parser) -> None:
     )
     add_remap(parser)
     _add_board(parser.add_argument_group('board'))
+    add_thickness(parser)
     _refuse_what_is_for_others(parser)
 
 
@@ -73,7 +75,7 @@ def _refuse_what_is_for_others(parser: Parser) -> None:
     parser.refuse(['--every', '--remap'], 'with a folder of pictures', lambda args: is_folder_of_pictures(args.source))
     parser.refuse(_OF_CIRCLES, 'without --target circles', lambda args: not args.target.endswith('circles'))
     parser.refuse(['--grid', '--spacing'], 'with --target markers', lambda args: args.target == 'markers')
-    parser.refuse(['--board'], 'without --target markers', lambda args: args.target != 'markers')
+    parser.refuse(['--board', '--plate-thickness'], 'without --target markers', lambda args: args.target != 'markers')
 
 
 def _has_points(args: argparse.Namespace) -> bool:
@@ -170,7 +172,7 @@ def _target(args: argparse.Namespace) -> Target:
     if args.board is None:
         raise InputError('--target markers needs --board, the marker map of the board')
     board = load_map(args.board)
-    return MarkerBoard(board, mapped_detector(board))
+    return MarkerBoard(board, mapped_detector(board, args.plate_thickness))
 
 
 def _place(text: str) -> tuple[int, int]:

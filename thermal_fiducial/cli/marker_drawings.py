@@ -125,7 +125,7 @@ def _board(args: argparse.Namespace) -> int:
     _write_all([*markers, base], args, [board])
     _say_what_is_weak(markers, args, bits.shape[1] + 2)
     save_map(board, _board_map(centres, options, args.dictionary))
-    _say_how_to_use(f'markers --board {board}')
+    _say_how_to_use(f'markers --board {board} --plate-thickness {args.thickness / 1e3:g}')
     return 0
 
 

@@ -35,6 +35,7 @@ PLATE = '--dictionary --size --thickness --stand-off --corner-radius --bridge-wi
         ([*BOARD, 'markers', '--diameter', '20'], '--diameter', 'markers'),
         *(([*INTRINSICS, 'views', *words.split()], words.split()[0], other) for words, other in (
             ('--board map.yaml', '--target markers'),
+            ('--plate-thickness 0.003', '--target markers'),
             ('--diameter 20', '--target circles'),
             ('--missing 0,0', '--target circles'),
             ('--longer-rows 1', '--target circles'),

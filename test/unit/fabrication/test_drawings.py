@@ -424,6 +424,7 @@ def test_commands_write_the_files_that_they_print(tmp_path, capsys):
     assert (
         main(['markers', 'board', 'markers', '--grid', '2', '1', '--formats', 'dxf', '--out', str(tmp_path / 'b')]) == 0
     )
+    assert capsys.readouterr().out.rstrip().endswith('board.yaml --plate-thickness 0.003')
     assert (Path(tmp_path) / 'b' / 'base-plate.dxf').is_file()
     board = load_map(tmp_path / 'b' / 'board.yaml')
     # Two markers of 130 mm with 40 mm between them.
