@@ -233,6 +233,9 @@ class Stage(EmptyStage):
         os.kill(os.getpid(), signal.SIGINT)
         %s
 
+    def finish(self):
+        print('finished', flush=True)
+
     def close(self):
         print('saved', flush=True)
 
@@ -272,10 +275,13 @@ HOLDS_THE_INTERPRETER = "re.match('(a+)+$', 64 * 'a' + 'b')"
     ],
 )
 def test_a_node_stops_silently(at_work, while_destroyed, while_python_ends, limit, status):
-    """Stopped in a callback that publishes, again while the interpreter ends, and with a library that never returns."""
+    """Stopped in a callback that publishes, again while the interpreter ends, and with a library that never returns.
+
+    What a flight leaves to do is done each time.
+    """
     program = ENDED % (at_work, while_destroyed, while_python_ends, limit)
     done = finished(program)
-    assert (done.returncode, done.stdout, done.stderr) == (status, 'saved\n', '')
+    assert (done.returncode, done.stdout, done.stderr) == (status, 'finished\nsaved\n', '')
 
 
 def test_a_node_that_crashes_and_does_not_end_is_no_stopped_one():

@@ -1,7 +1,7 @@
 """The run loop of all nodes."""
 
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 import os
 from pathlib import Path
 import sys
@@ -126,14 +126,14 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             ending.push(limit_the_end)
             ending.callback(node.close)
             executor.add_node(node)
-            _spin(node, executor, stop)
+            # A stop request shuts the context down, which the executor reports.
+            with suppress(ExternalShutdownException):
+                _spin(node, executor, stop)
             if node.deaf and not stop.asked:
                 return True
             node.finish()
         except InputError:
             raise
-        except ExternalShutdownException:
-            pass
         except Exception:
             # A stop request during construction makes rcl fail: not an error of the node.
             if ok() and not stop.asked:
