@@ -262,6 +262,11 @@ def crash(*_):
     raise RuntimeError('as no guard catches')
 run._spin = crash
 sys.exit(run.run(Stage))"""
+IS_DEAF = """
+def go_deaf(node, *_):
+    node.deaf = 'deaf'
+run._spin = go_deaf
+sys.exit(run.run(Stage))"""
 HOLDS_THE_INTERPRETER = "re.match('(a+)+$', 64 * 'a' + 'b')"
 
 
@@ -284,8 +289,9 @@ def test_a_node_stops_silently(at_work, while_destroyed, while_python_ends, limi
     assert (done.returncode, done.stdout, done.stderr) == (status, 'finished\nsaved\n', '')
 
 
-def test_a_node_that_crashes_and_does_not_end_is_no_stopped_one():
+@pytest.mark.parametrize('ending', [CRASHES, IS_DEAF])
+def test_a_node_that_crashes_or_is_deaf_and_does_not_end_is_no_stopped_one(ending):
     """It is to be started again: SIGPROF would say that it was asked to stop."""
-    program = ENDED.replace('sys.exit(run.run(Stage))', CRASHES) % ('pass', HOLDS_THE_INTERPRETER, 'pass', SHORT)
+    program = ENDED.replace('sys.exit(run.run(Stage))', ending) % ('pass', HOLDS_THE_INTERPRETER, 'pass', SHORT)
     done = finished(program)
     assert (done.returncode, done.stdout) == (-signal.SIGALRM, 'saved\n')

@@ -25,6 +25,10 @@ PROFILE = Path(__file__).with_name('fastdds.xml')
 _PROFILE_VARIABLES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 
 
+class _DeafError(Exception):
+    """DDS has left the node deaf."""
+
+
 def use_transport_profile() -> None:
     """Let Fast DDS send images through shared memory, unless the user has a profile; call before ``rclpy.init``."""
     if not any(os.environ.get(name) for name in _PROFILE_VARIABLES):
@@ -94,8 +98,9 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     drop_what_does_not_fit()
     stop = StopSignals(try_shutdown)
     try:
-        if _make_and_spin(make_node, args, stop):
-            _start_again()
+        _make_and_spin(make_node, args, stop)
+    except _DeafError:
+        _start_again()
     except InputError as error:
         say_last(f'{Path(sys.argv[0]).name}: {error}')
         return 2
@@ -110,8 +115,14 @@ def _start_again() -> None:
     os.execv(sys.executable, sys.orig_argv)
 
 
-def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None, stop: StopSignals) -> bool:
-    """Run a node to its orderly end; whether it is to be started again."""
+def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None, stop: StopSignals) -> None:
+    """Run a node to its orderly end.
+
+    Raises
+    ------
+    _DeafError
+        The node is to be started again.
+    """
     # Saving comes first in the shutdown, before steps that may fail or hang.
     with ExitStack() as ending:
         ending.callback(try_shutdown)
@@ -130,16 +141,15 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             with suppress(ExternalShutdownException):
                 _spin(node, executor, stop)
             if node.deaf and not stop.asked:
-                return True
+                raise _DeafError
             node.finish()
-        except InputError:
+        except (InputError, _DeafError):
             raise
         except Exception:
             # A stop request during construction makes rcl fail: not an error of the node.
             if ok() and not stop.asked:
                 raise
             limit_the_end()
-    return False
 
 
 def _made(make_node: Callable[[], StageNode[Any]]) -> StageNode[Any]:

@@ -11,7 +11,7 @@ STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 #: Timeouts of leaving the graph after all is saved: processor time [s], of which it takes 0.1 to 0.2, and wall time
 #: [s], of which it took 8 under tenfold overload.
 LEAVING_CPU_S, LEAVING_S = 2.0, 20.0
-#: Wall time of that for a node that crashed [s]: the sooner it is restarted, the better.
+#: Wall time of that for a node that crashed or is deaf [s]: the sooner it is restarted, the better.
 CRASHED_S = 5.0
 
 
