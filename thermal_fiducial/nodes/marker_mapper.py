@@ -72,10 +72,6 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         super().diagnose(stamp_ns)
         self._topics.draw_for_listeners(self.mapper.map, self._result.in_view, self._result.stamp_ns)
 
-    def finish(self) -> None:
-        """Refine the map once more at the end of a flight."""
-        self._map.finish()
-
     def state(self) -> tuple[bytes, str]:
         """Why the last frame gave no pose, doubts about map and file, quarantined markers, skipped frames."""
         left = self._frames.left_since()

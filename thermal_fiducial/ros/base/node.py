@@ -68,6 +68,8 @@ class StageNode(CountingNode, Generic[Config]):
             raise
         #: called before the node is destroyed
         self.endings: list[Callable[[], None]] = []
+        #: called before that at the end of a flight: not when the node is to start again, or has crashed
+        self.completions: list[Callable[[], None]] = []
         #: parameter values overridden by the node, for example by TF
         self._derived: dict[str, Any] = {}
         #: prefix of the names of the robot's frames
@@ -188,7 +190,9 @@ class StageNode(CountingNode, Generic[Config]):
         return {}
 
     def finish(self) -> None:
-        """Complete what a flight that ends leaves to do; not called by a node that is to start again, or crashed."""
+        """Run the ``completions``: what a flight that ends leaves to do."""
+        for complete in self.completions:
+            complete()
 
     def close(self) -> None:
         """Run the ``endings`` before the node is destroyed, for example to save files."""

@@ -31,7 +31,7 @@ class FilterMemory:
         name = node.get_fully_qualified_name().strip('/').replace('/', '_')
         domain = os.environ.get('ROS_DOMAIN_ID', '0')
         self._path = robot_folder() / f'{name}_{domain}.json'
-        node.endings.append(self._close)
+        node.completions.append(self._forget)
         last = recent_pose(self._path) if self._active else None
         if last is not None:
             self._take_up(last)
@@ -70,8 +70,8 @@ class FilterMemory:
         save_last_pose(self._path, LastPose(stamp_ns, state.T_map_body, filter_.camera_time_offset))
         self._active = True
 
-    def _close(self) -> None:
-        """On an orderly end delete the file: the next start is not in flight."""
+    def _forget(self) -> None:
+        """Delete the file at the end of a flight: the next start is not in flight."""
         if self._active:
             # On a disk that became read-only the file stays; its age soon invalidates it.
             with suppress(OSError):

@@ -51,6 +51,7 @@ class MapServices:
         self.mapper = MarkerMapper(config, self._first_map())
         self.refinement = MapRefinement(self.mapper, live=node.live)
         node.endings.append(self.close)
+        node.completions.append(self._finish)
         for name in ('save', 'load', 'undo', 'reset', 'refine'):
             node.serve(Trigger, f'~/{name}', _answer(getattr(self, name)))
         node.serve(SetBool, '~/freeze', self._on_freeze)
@@ -153,7 +154,7 @@ class MapServices:
         response.success, response.message = True, 'map frozen' if request.data else 'map free'
         return response
 
-    def finish(self) -> None:
+    def _finish(self) -> None:
         """Refine the map with the last keyframes of the flight, before it is saved at the end.
 
         A copy is saved first: whoever starts the node may kill it for taking its time.
