@@ -45,8 +45,8 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.filter.configure(config)
 
     def _on_imu(self, message: bytes) -> None:
-        self._frames.note_imu_frame(message_bytes.frame_id(message))
         sample = message_bytes.imu_sample(message)
+        self._frames.note_imu_frame(message_bytes.frame_id(message))
         odometry = self.filter.add_imu(sample)
         self._status.after_imu(sample.stamp_ns)
         if odometry is not None:

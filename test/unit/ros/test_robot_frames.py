@@ -231,6 +231,12 @@ def test_the_frame_of_the_imu_is_that_of_its_messages_where_tf_has_it():
     frames.note_imu_frame('imu_link')
     np.testing.assert_allclose(frames.T_imu_base, inverse(T_base_imu), atol=1e-12)
     np.testing.assert_allclose(in_force(robot), inverse(T_base_imu) @ FORWARD, atol=1e-12)
+    # A message of another source, or a garbled one, moves no camera in flight.
+    for frame in ('base_link', ''):
+        frames.note_imu_frame(frame)
+        assert repr(frame) in robot.events['imu']
+    assert len(robot.adopted) == 2
+    np.testing.assert_allclose(frames.T_imu_base, inverse(T_base_imu), atol=1e-12)
 
 
 def test_a_state_in_another_frame_of_the_body():

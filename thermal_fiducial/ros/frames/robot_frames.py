@@ -31,6 +31,8 @@ _PATIENCE = 2.0
 _SAME = 1e-6
 #: Largest distance of the robot frame from the IMU [m]: the range of the parameter ``camera_position``.
 _FARTHEST = 10.0
+#: Longest name of a frame that is printed [characters].
+_LONGEST_NAME = 100
 
 
 class RobotFrames:
@@ -73,10 +75,18 @@ class RobotFrames:
         return self.decided and self.source == _PARAMETERS
 
     def note_imu_frame(self, frame: str) -> None:
-        """Use the frame of an IMU message as the IMU frame, if TF or the URDF know it."""
-        if frame != self._imu_frame:
-            self._imu_frame = frame
-            self._look()
+        """Use the frame of an IMU message as the IMU frame, if TF or the URDF know it; a later one is only reported."""
+        if frame == self._imu_frame:
+            return
+        if self.source != _PARAMETERS and self._is_on_robot(self._imu_frame):
+            text = f'IMU in frame {frame[:_LONGEST_NAME]!r}: ignored until the node is restarted'
+            self._node.console.event('imu', text)
+            return
+        self._imu_frame = frame
+        self._look()
+
+    def _is_on_robot(self, frame: str) -> bool:
+        return self._trees[self.source].between(frame, self._node.config.base_frame) is not None
 
     def _on_description(self, message: String) -> None:
         prefix = self._node.frame_prefix
