@@ -9,6 +9,7 @@ import pytest
 from support.tasks import work
 
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.process.stopping import STOPS
 from thermal_fiducial.ros.process.worker import Background, Foreground
 
 
@@ -87,6 +88,17 @@ def signalled(number):
     (process,) = multiprocessing.active_children()
     os.kill(process.pid, number)
     return process
+
+
+@pytest.mark.parametrize('number', STOPS)
+def test_work_is_finished_for_a_node_that_is_stopped_with_all_its_processes(worker, tmp_path, number):
+    """By Ctrl-C, by a terminal that is closed, or as a service."""
+    end = tmp_path / 'end'
+    worker.start(end)
+    until((tmp_path / 'end.begun').exists)
+    signalled(number)
+    end.touch()
+    assert result_of(worker)[1] == end
 
 
 def test_a_process_that_is_killed_while_it_waits_is_replaced(worker):

@@ -139,7 +139,9 @@ class Background(Generic[Task, Result]):
 
 def _serve(function: Callable[[Task], Result], connection: Connection) -> None:
     """Process tasks until the connection closes; the first answer, None, signals that all imports are done."""
+    # A terminal, or who stops a service, signals all processes at once: the node decides what is still to be done.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     # The node that starts it may have real-time priority.
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.nice(10)
@@ -149,8 +151,11 @@ def _serve(function: Callable[[Task], Result], connection: Connection) -> None:
             task = connection.recv()
         except EOFError:
             return
+        # Only now: multiprocessing ends a process by it that is left over, and waits for it.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
         try:
             outcome: Result | Exception = function(task)
         except Exception as error:  # sent to the node, whatever it is
             outcome = error
         connection.send(outcome)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
