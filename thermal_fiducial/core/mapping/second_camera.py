@@ -16,7 +16,7 @@ from thermal_fiducial.core.frame_period import FramePeriod
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.located import squared_distance
-from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.measurements import CameraPose, LATEST_NS
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -90,8 +90,9 @@ class SecondCamera:
         self._T_body_first = T_body_first
         self._T_second_first = inverse(T_body_second) @ T_body_first
         self._waiting: CameraPose | None = None
-        #: stamp of the first camera's last pose, and period of its poses
+        #: stamps of the cameras' last poses, and period of the first one's
         self._first_ns: int | None = None
+        self._second_ns = 0
         self._period = FramePeriod()
         self.clock = SecondClock(time_offset_std, time_offset_random_walk)
         #: number of fused frames, of the second's poses published alone, and of those that contradicted the first
@@ -100,6 +101,10 @@ class SecondCamera:
     def add_second(self, pose: CameraPose, prior: MotionPrior) -> CameraPose | None:
         """Add a pose of the second camera; returned as a pose of the first, in its clock, while that has none."""
         pose = seen_from(pose, self._T_second_first)
+        if pose.stamp_ns < self._second_ns - LATEST_NS:
+            # The clock was set back: the first one's last pose says nothing of now.
+            self._first_ns = None
+        self._second_ns = pose.stamp_ns
         if self._first_ns is None or pose.stamp_ns - self._first_ns > self._period_ns + _LATE_NS:
             self.alone += 1
             in_clock = self._in_clock_of_first(pose, pose.stamp_ns, prior)

@@ -55,6 +55,13 @@ def test_an_exact_pose_of_the_second_is_one_of_the_first():
     assert cameras.alone == 1
 
 
+def test_after_a_clock_that_was_set_back_the_second_stands_in_as_before():
+    cameras, prior = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), MotionPrior()
+    cameras.with_second(pose(1_000_000 * MS, T_BODY_FIRST), prior)
+    stamps = [1000 * k * MS for k in (1001, 1002, 500, 501)]
+    assert all(cameras.add_second(second_pose(stamp, np.eye(4)), prior) for stamp in stamps)
+
+
 def test_a_pose_that_is_far_better_alone_stays_alone():
     """Ten times as good: with half of its information each, both together would be worse."""
     poor, good = pose(0, np.eye(4), (9e-6,) * 6), pose(0, transform(np.eye(3), [1e-3, 0.0, 0.0]), (9e-8,) * 6)
