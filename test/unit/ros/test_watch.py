@@ -5,6 +5,7 @@ import threading
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -170,10 +171,13 @@ def test_messages_of_real_nodes_are_heard_in_their_namespace():
 
 
 def speak(node, ending):
-    """What the nodes of a healthy robot publish, its odometry under another name."""
+    """What a healthy robot publishes, its odometry under another name, and a pose with an impossible stamp."""
     odometry = node.create_publisher(Odometry, 'state', qos.IMU_RATE_RESULT)
     markers = node.create_publisher(PointCloud2, 'markers', qos.RESULT)
     diagnostics = node.create_publisher(DiagnosticArray, '/diagnostics', qos.IMU_RATE_RESULT)
+    poses = node.create_publisher(PoseWithCovarianceStamped, 'camera_pose', qos.RESULT)
+    impossible = PoseWithCovarianceStamped()
+    impossible.header.stamp.sec = -1
     rows = np.zeros(1, MARKER_DTYPE)
     rows['id'], rows['qw'], rows['aqw'], rows['z'], rows['az'], rows['sigma_px'] = 5, 1.0, 1.0, 2.0, 2.0, 0.05
     for corner, (u, v) in enumerate(((10, 10), (50, 10), (50, 50), (10, 50))):
@@ -184,6 +188,7 @@ def speak(node, ending):
         message = Odometry(header=convert.header(now, 'map'))
         message.pose.covariance[0] = message.pose.covariance[7] = message.pose.covariance[14] = 1e-4
         odometry.publish(message)
+        poses.publish(impossible)
         markers.publish(clouds.cloud(rows, convert.header(now, 'camera')))
         figures = [KeyValue(key=key, value=value) for key, value in FIGURES.items()]
         status = [

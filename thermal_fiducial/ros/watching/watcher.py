@@ -14,8 +14,9 @@ from sensor_msgs.msg import PointCloud2
 
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.images import stamp_to_ns
 from thermal_fiducial.ros.base import qos
-from thermal_fiducial.ros.messages import clouds, convert
+from thermal_fiducial.ros.messages import clouds
 from thermal_fiducial.ros.watching.live_status import LiveStatus
 from thermal_fiducial.ros.watching.observer import observer
 
@@ -40,7 +41,7 @@ class Watcher:
             node.create_subscription(kind, topic, take, profile)
 
     def _age(self, head: Any) -> float:
-        return (self._node.get_clock().now().nanoseconds - convert.stamp_ns(head.stamp)) / SECOND_NS
+        return (self._node.get_clock().now().nanoseconds - stamp_to_ns(head.stamp)) / SECOND_NS
 
     def _on_odometry(self, message: Odometry) -> None:
         variances = np.asarray(message.pose.covariance).reshape(6, 6).diagonal()
