@@ -174,6 +174,12 @@ class Robot(SimpleNamespace):
             console=SimpleNamespace(event=events.__setitem__),
         )  # fmt: skip
 
+    def guard(self, callback, message):
+        try:
+            callback(message)
+        except InputError as error:
+            self.said.append(str(error))
+
     def derive(self, **values):
         self.config = PoseEkfConfig(**values)
 
@@ -217,6 +223,21 @@ def test_tf_that_agrees_with_the_parameters_changes_nothing():
     robot.taken['/tf_static'](static('base_link', CAMERA, FORWARD))
     assert robot.adopted == []
     assert robot.said == [f'camera on the robot ({CAMERA} in base_link): from /tf_static']
+
+
+@pytest.mark.usefixtures('tf2_msgs')
+@pytest.mark.parametrize(('place', 'w'), [([5e5, 5.4e6, 0.0], 1.0), ([0.0, 0.0, 0.0], 0.0)])
+def test_a_frame_that_is_none_keeps_no_other_one_of_its_message_back(place, w):
+    """The grid of a survey, and a rotation that was not filled in."""
+    robot = Robot()
+    frames = RobotFrames(robot)
+    other = convert.transform_message(transform(np.eye(3), place), 0, 'utm', 'map')
+    other.transform.rotation.w = w
+    (camera,) = static('base_link', CAMERA, FORWARD).transforms
+    robot.taken['/tf_static'](SimpleNamespace(transforms=[other, camera]))
+    assert '/tf_static: map' in robot.said[0]
+    assert frames.source == '/tf_static'
+    np.testing.assert_allclose(in_force(robot), FORWARD, atol=1e-12)
 
 
 @pytest.mark.usefixtures('tf2_msgs')

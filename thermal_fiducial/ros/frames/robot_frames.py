@@ -5,6 +5,7 @@ import importlib
 import math
 from typing import Any
 
+from geometry_msgs.msg import TransformStamped
 import numpy as np
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -96,9 +97,13 @@ class RobotFrames:
 
     def _on_static(self, message: Any) -> None:
         for item in message.transforms:
-            T_parent_child = convert.transform_of_message(item, '/tf_static')
-            self._trees[_TF].add(item.header.frame_id, item.child_frame_id, T_parent_child)
+            # One by one: a message may hold all static frames of a site, not only those of the robot.
+            self._node.guard(self._add, item)
         self._look()
+
+    def _add(self, item: TransformStamped) -> None:
+        T_parent_child = convert.transform_of_message(item, f'/tf_static: {item.child_frame_id}')
+        self._trees[_TF].add(item.header.frame_id, item.child_frame_id, T_parent_child)
 
     def _look(self) -> None:
         """Adopt the pose of the best source; a later change by the same source is only reported."""
