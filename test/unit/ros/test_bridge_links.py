@@ -10,6 +10,7 @@ from nav_msgs.msg import Odometry
 import pytest
 from support.ros_graph import ros_graph
 
+from thermal_fiducial.nodes.landing_target import LandingTarget
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.report.bridge_check import Level
 from thermal_fiducial.report.bridge_links import check_links
@@ -47,6 +48,19 @@ def test_one_sender_and_a_listener_are_in_order():
         found = listened(graph, node, topics)
         assert found == {'receivers': (Level.OK, '1 listen to /mavros/odometry/out')}
         assert topics[0].odometry == '/mavros/odometry/out'
+
+
+def test_of_two_robots_that_of_the_namespace_is_listened_to():
+    topics = []
+    with ros_graph() as graph:
+        for name in ('drone1', 'drone2'):
+            for kind in (PoseEkfNode, LandingTarget):
+                graph.added(kind(live=False, context=graph.context, namespace=name))
+        for name in ('drone1', 'drone2'):
+            arguments = ['-r', f'__ns:=/{name}']
+            bridge_listener.listen(0.1, print, print, print, announce=topics.append, ros_arguments=arguments)
+    assert [said.sender for said in topics] == ['/drone1/pose_ekf', '/drone2/pose_ekf']
+    assert [said.landing for said in topics] == ['/drone1/landing_target', '/drone2/landing_target']
 
 
 def test_two_publishers_and_a_missing_subscriber_are_reported():

@@ -104,9 +104,8 @@ def _find(node: Node, executor: Any, topic: str) -> Topics:
     found: list[Topics] = []
 
     def look() -> bool:
-        for name, namespace in node.get_node_names_and_namespaces():
-            if name == _FILTER and (topics := _topics_of_filter(node, namespace)) is not None:
-                found.append(topics)
+        every = (_topics_of_filter(node, namespace) for namespace in _namespaces(node, _FILTER))
+        found.extend(topics for topics in every if topics is not None)
         return bool(found)
 
     _spin(executor, DISCOVERY_S, look)
@@ -132,11 +131,17 @@ def _topics_of_filter(node: Node, namespace: str) -> Topics | None:
 
 def _landing_topic(node: Node) -> str:
     """Remapped topic of the node landing_target; empty if it does not run."""
-    for name, namespace in node.get_node_names_and_namespaces():
-        if name == _LANDING:
-            published = node.get_publisher_names_and_types_by_node(name, namespace)
-            return next((topic for topic, kinds in published if _POSE in kinds), '')
+    for namespace in _namespaces(node, _LANDING):
+        published = node.get_publisher_names_and_types_by_node(_LANDING, namespace)
+        return next((topic for topic, kinds in published if _POSE in kinds), '')
     return ''
+
+
+def _namespaces(node: Node, wanted: str) -> list[str]:
+    """Namespaces of the nodes with a name, those of the present ``node`` or below: others are of other robots."""
+    own = f'{node.get_namespace().rstrip("/")}/'
+    every = node.get_node_names_and_namespaces()
+    return [namespace for name, namespace in every if name == wanted and f'{namespace}/'.startswith(own)]
 
 
 def _note(array: DiagnosticArray, said: dict[str, DiagnosticStatus]) -> None:
