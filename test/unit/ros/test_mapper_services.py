@@ -14,6 +14,7 @@ from thermal_fiducial.files.map_history import entries
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import ERROR, WARN
 from thermal_fiducial.ros.mapper_node import map_status
 
 pytestmark = pytest.mark.ros
@@ -68,6 +69,18 @@ def test_load_undo_and_save_of_a_free_map(graph, map_file, mode):
     assert ask(graph, 'undo')[0]
     assert ask(graph, 'undo') == (False, f'{map_file}: no earlier version is kept')
     assert ask(graph, 'reset') == (True, '2 markers left')
+
+
+def test_a_map_file_that_was_mended_and_loaded_is_no_fault_any_more(graph, map_file):
+    text = map_file.read_text()
+    map_file.write_text('markers: [')
+    node = graph.add(MarkerMapperNode, map_file=str(map_file), mode='mapping')
+    assert not ask(graph, 'load')[0]
+    level, reason, _ = graph.diagnose(node)
+    assert (level, 'not valid YAML' in reason) == (ERROR, True)
+    map_file.write_text(text)
+    assert ask(graph, 'load')[0]
+    assert graph.diagnose(node)[:2] == (WARN, 'no markers')
 
 
 def test_a_full_disk_at_undo_costs_neither_the_map_nor_its_history_nor_the_node(graph, map_file, monkeypatch):

@@ -48,6 +48,8 @@ class MapServices:
         self._keeper = MapKeeper(file, config.marker_size, sizes, flown=node.live)
         self._disk = ThreadPoolExecutor(1)
         self._other_dictionary = ''
+        #: the fault of a map file that could not be read at the start
+        self._unread: list[str] = []
         self.mapper = MarkerMapper(config, self._first_map())
         self.refinement = MapRefinement(self.mapper, live=node.live)
         node.endings.append(self.close)
@@ -64,7 +66,9 @@ class MapServices:
         empty = MarkerMap(frame_id=config.map_frame, dictionary=config.dictionary)
         if not config.map_file:
             return empty
+        before = len(node.faults)
         loaded = node.attempt(self._read, empty)
+        self._unread = node.faults[before:]
         self._keeper.take()
         may_recover = node.live and config.mode == 'mapping'
         recovered, note = self._keeper.recover(config.autosave_period if may_recover else 0.0)
@@ -123,6 +127,8 @@ class MapServices:
         self._refuse_frozen()
         loaded = self._in_time(self._read)
         self._keeper.take()
+        while self._unread:
+            self._node.faults.remove(self._unread.pop())
         self._publish_jump(self.mapper.load(loaded))
         return f'{loaded.size_in_words} loaded from {self._keeper.path}'
 
