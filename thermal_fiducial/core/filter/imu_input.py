@@ -1,5 +1,6 @@
 """Checks of IMU samples at the filter's input: finite, in range, not frozen, stamps in order and on one clock."""
 
+from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 import math
@@ -76,7 +77,7 @@ class ImuInput:
 
     A stamp that does not follow the last one is refused, as a single bad one would be. If further stamps continue from
     it, it ended a gap; where it went back, or the gap is too long, the clock was set, the bag restarted or the IMU was
-    off, and the filter resets.
+    off, and the filter resets; also where stamps that went back have soon passed the last one again.
     """
 
     def __init__(self, max_gap: float, gyroscope_range: float, accelerometer_range: float) -> None:
@@ -87,6 +88,8 @@ class ImuInput:
         saturated = [math.inf] * 3 + [SATURATED_SECONDS] * 3
         self._axes = [Axis(*of_axis) for of_axis in zip(ranges, saturated, strict=True)]
         self._last_ns: int | None = None
+        #: the last samples that were used, which may come once more
+        self._used: deque[tuple[int, list[float]]] = deque(maxlen=CLOCK_EVIDENCE)
         #: since the last sample that was used; None: no sample
         self._strays: StrayRun | None = None
         #: longest recent step [ns]
@@ -113,9 +116,23 @@ class ImuInput:
         elif sample.stamp_ns == self._last_ns:
             return Verdict.REPEATED
         elif not 0 < sample.stamp_ns - self._last_ns <= self._usual_ns:
-            return self._stray(sample.stamp_ns)
-        self._follow(sample.stamp_ns)
-        return Verdict.USE
+            return Verdict.REPEATED if (sample.stamp_ns, values) in self._used else self._stray(sample.stamp_ns)
+        jump_ns = self._passed_again_ns()
+        self._used.append((sample.stamp_ns, values))
+        self._follow(sample.stamp_ns, jump_ns)
+        return Verdict.RESTART if jump_ns else Verdict.USE
+
+    def _passed_again_ns(self) -> int:
+        """Jump back of the stamps [ns] that have now passed the last sample again; 0 if they had not jumped.
+
+        Samples that were overtaken lie between those that were used. After a step of the clock both lie among each
+        other: the robot has moved on while stamps were refused.
+        """
+        run, last_ns = self._strays, self._last_ns
+        if run is None or last_ns is None or run.count < GAP_EVIDENCE:
+            return 0
+        among = any(run.first_ns <= stamp_ns <= run.last_ns for stamp_ns, _ in self._used)
+        return run.first_ns - last_ns if among else 0
 
     def _follow(self, stamp_ns: int, jump_ns: int = 0) -> None:
         assert self._last_ns is not None

@@ -150,3 +150,30 @@ def test_samples_in_swapped_pairs_end_a_gap(imu, noise):
     # the very first, with which the run begins anew.
     assert found[::2] == [Verdict.AHEAD] * 2 + [Verdict.USE] * 18
     assert found[1::2] == [Verdict.AHEAD] + [Verdict.BACKWARD] * 19
+
+
+@pytest.mark.parametrize('shift_ns', [0, 2_000_000])
+@pytest.mark.parametrize('steps', [4, 8])
+def test_a_clock_that_is_set_back_by_a_few_samples_is_a_jump_once_it_has_caught_up(imu, noise, steps, shift_ns):
+    """The robot has moved on meanwhile."""
+    before = [STEP_NS * k for k in range(100)]
+    after = [before[-1] + STEP_NS * (k - steps) + shift_ns for k in range(1, 20)]
+    found = stamped(imu, noise, before + after)[100:]
+    caught_up = next(place for place, ns in enumerate(after) if ns > before[-1])
+    assert set(found[:caught_up]) <= {Verdict.BACKWARD, Verdict.REPEATED}
+    assert found[caught_up:] == [Verdict.RESTART] + [Verdict.USE] * (18 - caught_up)
+
+
+@pytest.mark.parametrize('ahead', [1, 2, 3])
+def test_samples_that_were_overtaken_are_no_jump_of_the_clock(imu, noise, ahead):
+    """Of six samples the last ones come first."""
+    order = [*range(106 - ahead, 106), *range(100, 106 - ahead)]
+    found = stamped(imu, noise, [STEP_NS * k for k in [*range(100), *order, *range(106, 120)]])[100:]
+    assert found == [Verdict.USE] * ahead + [Verdict.BACKWARD] * (6 - ahead) + [Verdict.USE] * 14
+
+
+def test_samples_that_come_once_more_are_no_jump_of_the_clock(imu, noise):
+    readings = noise(100)
+    verdicts(imu, readings)
+    assert set(verdicts(imu, readings[-6:], 94)) == {Verdict.REPEATED}
+    assert set(verdicts(imu, noise(20), 100)) == {Verdict.USE}
