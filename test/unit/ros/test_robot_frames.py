@@ -241,15 +241,17 @@ def test_a_frame_that_is_none_keeps_no_other_one_of_its_message_back(place, w):
 
 
 @pytest.mark.usefixtures('tf2_msgs')
-def test_the_frame_of_the_imu_is_that_of_its_messages_where_tf_has_it():
+@pytest.mark.parametrize('slash', ['', '/'])
+def test_the_frame_of_the_imu_is_that_of_its_messages_where_tf_has_it(slash):
+    """Also with the slash that names of ROS 1 begin with."""
     robot = Robot()
     frames = RobotFrames(robot)
-    robot.taken['/tf_static'](static('base_link', CAMERA, FORWARD))
+    robot.taken['/tf_static'](static(f'{slash}base_link', f'{slash}{CAMERA}', FORWARD))
     T_base_imu = transform(so3_exp([0.0, 0.0, 0.5]), [0.0, 0.1, 0.0])
     robot.taken['/tf_static'](static('base_link', 'imu_link', T_base_imu))
     frames.note_imu_frame('unheard_of')
     assert frames.T_imu_base is None
-    frames.note_imu_frame('imu_link')
+    frames.note_imu_frame(f'{slash}imu_link')
     np.testing.assert_allclose(frames.T_imu_base, inverse(T_base_imu), atol=1e-12)
     np.testing.assert_allclose(in_force(robot), inverse(T_base_imu) @ FORWARD, atol=1e-12)
     # A message of another source, or a garbled one, moves no camera in flight.

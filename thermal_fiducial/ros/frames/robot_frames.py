@@ -77,6 +77,7 @@ class RobotFrames:
 
     def note_imu_frame(self, frame: str) -> None:
         """Use the frame of an IMU message as the IMU frame, if TF or the URDF know it; a later one is only reported."""
+        frame = frame.lstrip('/')
         if frame == self._imu_frame:
             return
         if self.source != _PARAMETERS and self._is_on_robot(self._imu_frame):
@@ -103,7 +104,9 @@ class RobotFrames:
 
     def _add(self, item: TransformStamped) -> None:
         T_parent_child = convert.transform_of_message(item, f'/tf_static: {item.child_frame_id}')
-        self._trees[_TF].add(item.header.frame_id, item.child_frame_id, T_parent_child)
+        # Names of ROS 1 begin with a slash, which tf2 ignores.
+        parent, child = item.header.frame_id.lstrip('/'), item.child_frame_id.lstrip('/')
+        self._trees[_TF].add(parent, child, T_parent_child)
 
     def _look(self) -> None:
         """Adopt the pose of the best source; a later change by the same source is only reported."""
