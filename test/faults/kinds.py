@@ -65,6 +65,7 @@ def _imu() -> list[Fault]:
     for_good = {
         'one stamp 0.5 s ahead': imu_faults.one_stamp_ahead,
         'clock steps by 10 ms': imu_faults.clock_step(0.01),
+        'clock steps by -50 ms': imu_faults.clock_step(-0.05),
         'clock steps by -0.2 s': imu_faults.clock_step(-0.2),
         'clock steps by 0.5 s': imu_faults.clock_step(0.5),
         'all clocks step by an hour': imu_faults.all_stamps_ahead,
