@@ -117,22 +117,20 @@ class ImuInput:
             return Verdict.REPEATED
         elif not 0 < sample.stamp_ns - self._last_ns <= self._usual_ns:
             return Verdict.REPEATED if (sample.stamp_ns, values) in self._used else self._stray(sample.stamp_ns)
-        jump_ns = self._passed_again_ns()
+        jump_ns = self._passed_again_ns(self._strays) if self._strays else 0
         self._used.append((sample.stamp_ns, values))
         self._follow(sample.stamp_ns, jump_ns)
         return Verdict.RESTART if jump_ns else Verdict.USE
 
-    def _passed_again_ns(self) -> int:
-        """Jump back of the stamps [ns] that have now passed the last sample again; 0 if they had not jumped.
+    def _passed_again_ns(self, run: StrayRun) -> int:
+        """Jump back of the stamps [ns] whose ``run`` has now passed the last sample again; 0 if they had not jumped.
 
         Samples that were overtaken lie between those that were used. After a step of the clock both lie among each
         other: the robot has moved on while stamps were refused.
         """
-        run, last_ns = self._strays, self._last_ns
-        if run is None or last_ns is None or run.count < GAP_EVIDENCE:
-            return 0
+        assert self._last_ns is not None
         among = any(run.first_ns <= stamp_ns <= run.last_ns for stamp_ns, _ in self._used)
-        return run.first_ns - last_ns if among else 0
+        return run.first_ns - self._last_ns if among and run.count >= GAP_EVIDENCE else 0
 
     def _follow(self, stamp_ns: int, jump_ns: int = 0) -> None:
         assert self._last_ns is not None
