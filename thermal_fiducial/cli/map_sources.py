@@ -33,12 +33,13 @@ from thermal_fiducial.files.dictionary import (
 from thermal_fiducial.files.map_history import digest, save_with_history
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.reading import require_regular
+from thermal_fiducial.files.recordings import LARGEST_SIGMA_PX, MOST_IDS
 from thermal_fiducial.map_tools import map_editing
 from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.map_tools.map_doubts import Doubt, doubts
 
-# Bounds above all stamps [ns] and corners [px], above all IDs, and above standard deviations of corners [px].
-_LARGEST_VALUE, _LARGEST_ID, _LARGEST_SIGMA_PX = 9.2e18, 100_000, 100.0
+# Bound above all stamps [ns] and corners [px].
+_LARGEST_VALUE = 9.2e18
 # Standard deviations of entries without a covariance, which were written by hand.
 _HAND_STD_M, _HAND_STD_DEG = 0.1, 5.0
 # Share of the markers whose centres may lie outside the image: partially visible ones at its border.
@@ -284,7 +285,7 @@ def _detection_table(path: Path) -> FloatArray:
         except ValueError:
             raise InputError(f'{path}: line {number}: not a detection') from None
         finite = all(abs(value) < _LARGEST_VALUE for value in values)
-        if not (finite and values[1] in range(_LARGEST_ID) and 0.0 < values[2] < _LARGEST_SIGMA_PX):
+        if not (finite and values[1] in range(MOST_IDS) and 0.0 < values[2] < LARGEST_SIGMA_PX):
             raise InputError(f'{path}: line {number}: not a detection')
         rows.append(values)
     return np.array(rows).reshape(-1, len(names))

@@ -224,7 +224,7 @@ def expect(
     T = viewed_at(distance, np.radians(tilt_deg), rng.uniform(0.0, 2.0 * np.pi, _SAMPLES), camera)
     corners = camera.project(se3.apply(T, marker_corners(size)))
     narrow_px = narrow_sides(corners)
-    in_image = np.all((corners >= 0.0) & (corners <= (camera.width - 1, camera.height - 1)), axis=(1, 2))
+    in_image = camera.contains(corners).all(axis=1)
     found = np.where(in_image, measurements.found_share(narrow_px, contrast, tilt_deg, bits), 0.0)
     share = float(found.mean())
     if share == 0.0:

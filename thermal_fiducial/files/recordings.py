@@ -28,12 +28,14 @@ from thermal_fiducial.files.records import is_imu_reading
 from thermal_fiducial.files.rig_files import body_sensor, densities, of_camchain, of_rig, of_sensor, Rig
 from thermal_fiducial.files.trajectory_file import load_tum
 
-#: Limit of marker IDs, above any dictionary; deviation of a quaternion's norm from 1, as in maps.
-_IDS, _NORM_TOLERANCE = 100_000, 0.01
+#: Limit of the marker IDs of detections, above any dictionary, and of their corners' standard deviations [px].
+MOST_IDS, LARGEST_SIGMA_PX = 100_000, 100.0
+#: Deviation of a quaternion's norm from 1, as in maps.
+_NORM_TOLERANCE = 0.01
 #: Limit of stamps: messages have 32-bit seconds.
 _LATEST_NS = 2**31 * SECOND_NS
-#: Limits of corners and their standard deviation [px]: a corner may lie outside the picture, but within this range.
-_FARTHEST_CORNER, _LARGEST_SIGMA = 1e5, 100.0
+#: Limit of corners [px]: they may lie outside the picture, but within this range.
+_FARTHEST_CORNER = 1e5
 #: Plausible IMU samples: period [s], specific force at rest [g], largest turn rate [rad/s].
 _STEPS_S, _IN_G, _FAST = (2e-5, 1.0), (0.8, 1.2), 35.0
 
@@ -250,9 +252,9 @@ def _is_detection(row: list[float]) -> bool:
     """Whether a row has an ID, eight coordinates and optionally a standard deviation."""
     corners, sigma = row[1:9], row[9:10]
     return (
-        row[0] in range(_IDS)
+        row[0] in range(MOST_IDS)
         and max(map(abs, corners)) < _FARTHEST_CORNER
-        and all(0 < s < _LARGEST_SIGMA for s in sigma)
+        and all(0 < s < LARGEST_SIGMA_PX for s in sigma)
     )
 
 

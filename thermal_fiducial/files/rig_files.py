@@ -84,7 +84,7 @@ def of_sensor(camera: Path, imu: Path) -> Rig:
     entry, other = _document(camera), _document(imu)
     lens = _lens(entry, *_resolution(entry), _pinhole(entry), 'distortion_model', 'distortion_coefficients')
     # ASL's names of the noise densities are those of Kalibr.
-    return Rig(lens, inverse(body_sensor(imu)) @ body_sensor(camera), _noise(other))
+    return Rig(lens, inverse(_body_sensor(other)) @ _body_sensor(entry), _noise(other))
 
 
 def body_sensor(path: Path) -> FloatArray:
@@ -95,7 +95,11 @@ def body_sensor(path: Path) -> FloatArray:
     InputError
         Missing or no rigid transform.
     """
-    return _rigid(_needed(_needed(_document(path), 'T_BS'), 'data'))
+    return _body_sensor(_document(path))
+
+
+def _body_sensor(document: Value) -> FloatArray:
+    return _rigid(_needed(_needed(document, 'T_BS'), 'data'))
 
 
 def of_camchain(path: Path, camera: str, noise: Mapping[str, float]) -> Rig:
