@@ -15,7 +15,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import INCONSISTENT_PX, of_single_error
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference
-from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
 from thermal_fiducial.core.mapping.localization import DECISIVE, names
 from thermal_fiducial.core.mapping.located import (
     error_std_px,
@@ -39,9 +39,9 @@ QUARANTINE, RELEASE = 0.7, 0.1
 DISAGREEMENT = 4.0
 #: Markers that must have agreed with odometry for it to count against another: two against one.
 _WITNESSES = 2
-#: A marker is misplaced from this distance on [m]: where odometry is wrong by less, following the marker costs less
-#: than losing the pose.
-_FAR = 0.2
+#: A marker is misplaced from this distance on [m], or from this angle on [rad]: where odometry is wrong by less,
+#: following the marker costs less than losing the pose. At 1 m from the marker the angle displaces by as much.
+_FAR, _TURNED = 0.2, 0.2
 #: An estimate that drifts away contradicts a marker in view a little at first. A marker that is misplaced is far away
 #: at once: nothing has contradicted odometry for this long [ns].
 _BEFORE_NS = SECOND_NS // 3
@@ -139,7 +139,9 @@ class Consistency:
         T_moved = location.pose.T_map_camera @ inverse(frame.predicted.pose.T_map_camera)
         T_map_marker = location.sight.T_map_marker[0]
         distance = float(np.linalg.norm((inverse(T_moved) @ T_map_marker - T_map_marker)[:3, 3]))
-        return MisplacedMarker(marker_id, frame.stamp_ns, T_moved, distance) if distance >= _FAR else None
+        angle = float(rotation_angle(T_moved[:3, :3]))
+        is_misplaced = distance >= _FAR or angle >= _TURNED
+        return MisplacedMarker(marker_id, frame.stamp_ns, T_moved, distance, angle) if is_misplaced else None
 
     def add(self, frame: LocatedFrame) -> None:
         """Note whether a frame and its outcome agree with odometry."""

@@ -148,13 +148,15 @@ class MisplacedMarker:
     since_ns: int
     #: (4, 4) with T_map_camera by the marker = T_moved @ T_map_camera by odometry, in the first such frame
     T_moved: FloatArray
-    #: between the marker and its place in the map [m]
+    #: between the marker and its place in the map [m], and its turn from there [rad]
     distance: float
+    angle: float
 
     @property
     def reason(self) -> str:
         """Why there is no pose from it, in words."""
-        return f'marker {self.id} alone is {self.distance:.1f} m from its place: moved, or a second one of its ID?'
+        apart = f'{self.distance:.1f} m, {math.degrees(self.angle):.0f} deg'
+        return f'marker {self.id} alone is {apart} from its place: moved, or a second one of its ID?'
 
 
 @dataclass(frozen=True)

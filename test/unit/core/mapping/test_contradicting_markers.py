@@ -77,10 +77,11 @@ def test_markers_that_agree_are_all_used():
         assert result.pose.marker_ids == (1, 2)
 
 
-def alone(seen_at, frames, known=(1, 2, 3, 4), drift=None):
+def alone(seen_at, frames, known=(1, 2, 3, 4), drift=None, turn=0.0):
     """Results of frames: all of ``known`` in view for 20 frames, then one alone, ``seen_at(k)``: its ID, its shift [m].
 
     ``frames``: their numbers, or how many. ``drift(k)``: error of odometry [m] and factor on its standard deviations.
+    ``turn``: of the one alone in its own plane [rad].
     """
     rng = np.random.default_rng(4)
     poses = {key: T for key, T in wall(rng).items() if key in known}
@@ -93,7 +94,7 @@ def alone(seen_at, frames, known=(1, 2, 3, 4), drift=None):
         there = poses
         if k >= 20:
             key, shift = seen_at(k)
-            there = {key: poses[key] @ transform(np.eye(3), [shift, 0.0, 0.0])}
+            there = {key: poses[key] @ transform(so3_exp([0.0, 0.0, turn]), [shift, 0.0, 0.0])}
         state = odometry(k)
         error, factor = drift(k) if drift else (0.0, 1.0)
         T = transform(np.eye(3), [error, 0.0, 0.0]) @ state.T_map_body
@@ -112,7 +113,16 @@ def test_a_second_plate_of_an_id_alone_in_view_gives_no_pose_however_long_it_is_
     results = alone(lambda k: (2, 0.5), 80, drift=lambda k: (0.0, 1.0 + max(k - 20, 0)))
     assert published(results) == list(range(20))
     # Its shift by 0.5 m, by odometry.
-    assert results[-1].reason == 'marker 2 alone is 0.5 m from its place: moved, or a second one of its ID?'
+    assert results[-1].reason == 'marker 2 alone is 0.5 m, 0 deg from its place: moved, or a second one of its ID?'
+
+
+@pytest.mark.parametrize('degrees', [20, 90, -90, 180])
+def test_a_marker_that_was_turned_where_it_hangs_gives_no_pose_alone(degrees):
+    """By a quarter its corners are those of the map, in another order: the robot seems to lie on its side."""
+    results = alone(lambda k: (2, 0.0), 60, turn=np.radians(degrees))
+    assert published(results) == list(range(20))
+    # Odometry is known to 0.2 deg.
+    assert f'0.0 m, {abs(degrees)} deg from its place' in results[-1].reason
 
 
 def test_back_in_its_place_it_gives_poses_again():
