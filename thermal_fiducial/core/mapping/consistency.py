@@ -185,10 +185,7 @@ class Consistency:
         if len(known) < 2:
             return False
         ratios = errors_px / error_std_px
-        blamed = ratios > DISAGREEMENT
-        if blamed.any():
-            blamed = inconsistent(blamed, known.tolist())
-        blamed = blamed | left_out
+        blamed = self._blamed(ratios > DISAGREEMENT, left_out, known.tolist())
         changed = False
         columns = blamed.tolist(), errors_px.tolist(), ratios.tolist()
         for marker, bad, error, ratio in zip(known, *columns, strict=True):
@@ -204,6 +201,22 @@ class Consistency:
                 continue
             changed = True
         return changed
+
+    def _blamed(self, disagrees: BoolArray, left_out: BoolArray, known: list[MapMarker]) -> BoolArray:
+        """Which of N markers (N,) a frame is evidence against.
+
+        One that odometry has agreed with before, and contradicts now, has moved. Odometry that has not may come from
+        the other one alone, and decides only where neither is known better.
+        """
+        either = disagrees | left_out
+        if not either.any():
+            return either
+        by_map = inconsistent(either, known)
+        if not left_out.any():
+            return by_map
+        has_agreed = np.array([marker.id in self._witnesses for marker in known])
+        better_known = np.array([marker.trusted for marker in known]) & by_map
+        return by_map if better_known.any() and not np.any(left_out & has_agreed) else either
 
     def flag(self, markers: dict[int, MapMarker], outliers: Mapping[int, float]) -> None:
         """Put markers in quarantine that a bundle adjustment found inconsistent; frames may release them later.

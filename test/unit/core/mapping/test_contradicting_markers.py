@@ -24,18 +24,18 @@ def odometry(k):
     return Odometry(stamp(k), flight(k / 30), np.zeros(3), np.zeros(3), covariance, np.diag([0.02] * 6) ** 2)
 
 
-def flown(moved, shift, turn=0.0, frames=40, with_odometry=True):
-    """Results of frames with markers 1 and 2, of which ``moved`` hangs elsewhere than in the map."""
+def flown(moved, shift, turn=0.0, frames=40, with_odometry=True, since=0, fixed=(1, 2)):
+    """Results of frames with markers 1 and 2, of which ``moved`` hangs elsewhere than in the map from ``since`` on."""
     rng = np.random.default_rng(3)
     poses = {key: T for key, T in wall(rng).items() if key in (1, 2)}
     mapper = MarkerMapper(
         MarkerMapperConfig(mode='localization', camera_orientation=(0.0, 0.0, 0.0, 1.0)),
-        MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in poses.items()}),
+        MarkerMap({key: MapMarker(key, SIZE, key in fixed, T) for key, T in poses.items()}),
     )
     there = poses | {moved: poses[moved] @ transform(so3_exp([0.0, turn, 0.0]), [shift, 0.0, 0.0])}
     results = []
     for k in range(frames):
-        rows = see(flight(k / 30), there, 0.02, rng)
+        rows = see(flight(k / 30), there if k >= since else poses, 0.02, rng)
         prior = motion_prior(odometry(k)) if with_odometry else None
         results.append(mapper.process(stamp(k), rows, CAMERA, prior))
     return results
@@ -53,6 +53,20 @@ def test_the_pose_comes_from_the_marker_that_odometry_agrees_with(moved, shift, 
         assert error @ np.linalg.solve(result.pose.covariance, error) < 22.5
     # Most of the last 20 frames.
     assert list(results[-1].quarantined) == [moved]
+
+
+@pytest.mark.parametrize('moved', [1, 2])
+def test_also_a_fixed_marker_may_be_knocked_from_its_place(moved):
+    """The other one alone gives the poses from then on, and is not quarantined for its lower rank."""
+    results = flown(moved, 0.1, frames=60, since=20, fixed=(1,))
+    assert all(result.pose for result in results)
+    assert list(results[-1].quarantined) == [moved]
+
+
+def test_odometry_that_has_never_agreed_with_a_fixed_marker_does_not_put_it_in_quarantine():
+    """It may come from the other one, which is in the map in a wrong place."""
+    results = flown(1, 0.1, fixed=(1,))
+    assert list(results[-1].quarantined) == [2]
 
 
 @pytest.mark.parametrize('moved', [1, 2])
