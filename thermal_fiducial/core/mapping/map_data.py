@@ -243,11 +243,19 @@ def align(resting: Mapping[int, MapMarker], moving: Mapping[int, MapMarker]) -> 
 
 
 def jump(new: Mapping[int, MapMarker], old: Mapping[int, MapMarker]) -> FloatArray | None:
-    """T_new_old (4, 4) of two maps of one place; None where they have no marker in common, or one of two sizes."""
+    """T_new_old (4, 4) of two maps of one place; None where they have no marker in common, or one of two sizes.
+
+    The fixed markers hold both maps in place; the others, which an edit may have moved, count where there are none.
+    """
+    held = {key: marker for key, marker in old.items() if key in new and _holds(marker) and _holds(new[key])}
     try:
-        return align(new, old).T
+        return align(new, held or old).T
     except InputError:
         return None
+
+
+def _holds(marker: MapMarker) -> bool:
+    return marker.fixed and marker.trusted
 
 
 def _distances(T: FloatArray, target: FloatArray, source: FloatArray) -> FloatArray:

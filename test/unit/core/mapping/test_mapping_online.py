@@ -1,15 +1,17 @@
 """The mapper over whole flights: joint refinement behind it, jumps, gaps, starts in doubt, size of the map."""
 
+from dataclasses import replace
 import time
 
 import numpy as np
+import pytest
 from support.scenes import motion_prior
 from support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import covariance_of
 from thermal_fiducial.core.geometry.reprojection import difference, retract
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import CONTRADICTED, MarkerMapper
@@ -158,6 +160,19 @@ def test_another_map_is_taken_over_and_the_jump_returned():
     elsewhere = MarkerMap({90: MapMarker(90, SIZE, True, np.eye(4))})
     assert m.load(elsewhere) is None
     assert sorted(m.map.markers) == [90]
+
+
+@pytest.mark.parametrize('moved', [2, 3])
+def test_a_marker_whose_place_is_mended_moves_no_poses_if_a_fixed_one_stays(moved):
+    """Though as many markers have moved as have not, or more."""
+    T_wrong = transform(np.eye(3), [0.5, 0.0, 0.0])
+    true = {key: MapMarker(key, SIZE, key == 0, T) for key, T in wall(np.random.default_rng(11), 4).items()}
+    wrong = {key: replace(marker, T_map_marker=T_wrong @ marker.T_map_marker) for key, marker in true.items() if key}
+    m = MarkerMapper(MarkerMapperConfig(), MarkerMap(true | dict(list(wrong.items())[:moved])))
+    np.testing.assert_allclose(m.load(MarkerMap(true)), np.eye(4), atol=1e-9)
+    # One that was in quarantine says nothing of where the map is.
+    m = MarkerMapper(MarkerMapperConfig(), MarkerMap(true | wrong | {0: replace(true[0], trusted=False)}))
+    np.testing.assert_allclose(m.load(MarkerMap(true)), inverse(T_wrong), atol=1e-9)
 
 
 def test_refinement_continues_when_the_keyframe_budget_is_used_up():
