@@ -90,12 +90,14 @@ class MarkerMapper:
         self._keyframes = KeyframeStore(self.config.keyframe_budget, self.map)
 
     def use_map_of(self, owner: 'MarkerMapper') -> None:
-        """Locate in the map of ``owner`` as it is now, and change nothing in it, quarantine included."""
+        """Locate in the map of ``owner`` as it is now, and change nothing in it, quarantine included.
+
+        Which markers agree with odometry, and which one is misplaced, both learn together: one robot carries them.
+        """
         if owner._initial is not self._initial:
             # Poses in a map that was replaced say nothing of this one.
             self._initial, self._last = owner._initial, None
-            self._consistency = Consistency(owner.map.markers)
-        self.map = owner.map
+        self.map, self._consistency = owner.map, owner._consistency
         self.frozen, self._owns_map = True, False
 
     def process(

@@ -139,6 +139,22 @@ def test_a_marker_that_was_turned_where_it_hangs_gives_no_pose_alone(degrees):
     assert f'0.0 m, {abs(degrees)} deg from its place' in results[-1].reason
 
 
+def test_what_one_camera_has_seen_counts_for_the_other_one_on_the_robot():
+    """The first has seen the markers of a wall in their places; the second sees the one alone that hangs elsewhere."""
+    rng = np.random.default_rng(4)
+    poses = {key: T for key, T in wall(rng).items() if key in (1, 2, 3, 4)}
+    config = MarkerMapperConfig(mode='localization', camera_orientation=(0.0, 0.0, 0.0, 1.0))
+    first = MarkerMapper(config, MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in poses.items()}))
+    second = MarkerMapper(config, first.map)
+    moved = {2: poses[2] @ transform(np.eye(3), [0.5, 0.0, 0.0])}
+    for k in range(40):
+        mapper, there = (first, poses) if k < 20 else (second, moved)
+        second.use_map_of(first)
+        result = mapper.process(stamp(k), see(flight(k / 30), there, 0.02, rng), CAMERA, motion_prior(odometry(k)))
+        assert (result.pose is not None) == (k < 20)
+    assert 'marker 2 alone is 0.5 m' in result.reason
+
+
 def test_back_in_its_place_it_gives_poses_again():
     results = alone(lambda k: (2, 0.5 if k < 40 else 0.0), 60)
     assert published(results) == [*range(20), *range(40, 60)]
