@@ -62,6 +62,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
 
     def _on_map_moved(self, T_new_old: FloatArray) -> None:
         self.filter.move_map(T_new_old)
+        self._outputs.clear_path()
         self._status.jumps += 1
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -7,7 +7,7 @@ import time
 
 import cv2
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
 import numpy as np
 import pytest
 from rcl_interfaces.srv import DescribeParameters, SetParameters
@@ -770,6 +770,19 @@ def test_the_estimate_moves_with_the_map(graph):
     fly(graph, [pose(56), imu(60), pose(59, T_new_old @ small_bag.T_BODY_CAMERA), imu(61)])
     np.testing.assert_allclose(node.filter.state.T_map_body, T_new_old, atol=0.01)
     assert graph.diagnose(node)[:2] == (OK, 'tracking')
+
+
+def test_a_path_has_no_poses_in_the_map_before(graph):
+    graph.listen(Path, 'path')
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
+    fly(graph, [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
+    graph.send('map_correction', correction(57, transform(np.eye(3), [7.0, 0.0, 0.0])))
+    fly(graph, [imu(60)])
+    graph.diagnose(node)
+    graph.spin_until(lambda: graph.heard['path'])
+    (newest,) = graph.heard['path'][-1].poses
+    # The robot is at rest in the origin of the map before; the filter knows that to a centimetre by then.
+    assert newest.pose.position.x == pytest.approx(7.0, abs=0.01)
 
 
 def test_a_late_frame_from_before_a_correction_is_published_in_the_map_of_its_stamp(graph, tmp_path):
