@@ -634,7 +634,7 @@ def test_a_reset_is_logged_with_its_reason_and_then_the_recovery(graph, capfd):
     assert lines == [
         'initialised: tracking',
         'reset: the poses contradict the estimate and agree with each other; '
-        'if in fast motion: readout_time, bolometer_lag?',
+        'if in fast motion: readout_time, bolometer_lag? if again and again: axes, sign, units of the IMU?',
         'reset: on request',
         'waiting for markers',
         'recovered: tracking',

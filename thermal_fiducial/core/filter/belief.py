@@ -27,10 +27,14 @@ _REFUTED = 3
 NEVER = -(1 << 62)
 #: Verdicts kept, and poses over which the diagnostics average the normalised innovation squared (NIS).
 _KEPT, _NIS_POSES = 300, 30
-#: Reason of a reset. In fast motion poses are off together by a line readout or a lag that is not as declared.
+#: Reasons of a reset. In fast motion poses are off together by a line readout or a lag that is not as declared; an IMU
+#: with wrong axes passes for a good one at rest, and contradicts all poses as soon as the robot moves.
+_AGAIN = 'if again and again: axes, sign, units of the IMU?'
 OUTVOTED = (
-    'the poses contradict the estimate and agree with each other; if in fast motion: readout_time, bolometer_lag?'
+    'the poses contradict the estimate and agree with each other; if in fast motion: readout_time, bolometer_lag? '
+    + _AGAIN
 )
+LOST = f'the pose was lost, and poses agree with each other; {_AGAIN}'
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +154,7 @@ class Belief(NamedTuple):
             return f'no pose was accepted for {config.reinitialise_after:.0f} s'
         # Relative to the map: in one that is known poorly the pose may not be flown on, but the estimate is good.
         if main.estimate.std(POSITION) > config.lost_position_std:
-            return 'the pose was lost, and markers are seen again'
+            return LOST
         lasting = other.accepted_ns - other.started_ns >= config.reset_after * SECOND_NS
         against = main.hits - self.hits_before
         agreed = other.hits >= max(2 * other.misses, _PREFERRED * against, other.needed)

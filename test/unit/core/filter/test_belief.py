@@ -83,7 +83,8 @@ def test_poses_that_contradict_the_estimate_and_agree_reset_it():
     assert belief.resets == 1
     # With the parameters that do this in fast motion: a line readout of 16 ms that was not declared did.
     assert belief.reset_reason == (
-        'the poses contradict the estimate and agree with each other; if in fast motion: readout_time, bolometer_lag?'
+        'the poses contradict the estimate and agree with each other; if in fast motion: readout_time, bolometer_lag? '
+        'if again and again: axes, sign, units of the IMU?'
     )
 
 
@@ -114,7 +115,9 @@ def test_poses_that_the_estimate_accepts_meanwhile_speak_against_a_reset(accepte
 def test_an_estimate_that_is_lost_is_replaced_by_the_fewest_poses():
     begun = hypothesis(hits=3, accepted_ns=3 * FRAME_NS)
     lost = Belief(main=hypothesis(1.01, hits=30), alternative=begun, hits_before=30)
-    assert lost.settled(CONFIG).reset_reason == 'the pose was lost, and markers are seen again'
+    assert lost.settled(CONFIG).reset_reason == (
+        'the pose was lost, and poses agree with each other; if again and again: axes, sign, units of the IMU?'
+    )
     known = lost._replace(main=hypothesis(0.99, hits=30))
     assert known.settled(CONFIG) is known
 

@@ -1,10 +1,13 @@
 """The filter's condition in words, from what its history holds."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from support.flights import config, Flight, Motion
+from support.flights import config, Flight, Motion, run, timeline
 
 from thermal_fiducial.core.filter.belief import REFUSALS_OF_DOUBT
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.output import (
     COASTING_S,
@@ -77,3 +80,13 @@ def test_a_sensor_that_poses_contradict_is_named_until_the_filter_is_initialised
     # the mean's noise, of 100 samples at 200 Hz of 2e-3 m/s^2/sqrt(Hz) is below the digit that is said
     assert condition.details.startswith('the IMU says ')
     assert '-9.8 m/s^2' in condition.details
+
+
+def test_a_gyroscope_of_wrong_sign_is_named_also_after_the_start():
+    """It passes at rest. In motion the poses reset the filter again and again, although markers are always in view."""
+    flight, ekf = Flight(seed=1, seconds=8.0), PoseEkf(CONFIG)
+    samples = flight.samples()
+    wrong = [replace(sample, angular_velocity=-sample.angular_velocity) for sample in samples[RATE:]]
+    run(ekf, timeline(samples[:RATE] + wrong, flight.poses))
+    assert ekf.resets > 1
+    assert 'axes, sign, units of the IMU?' in ekf.reset_reason
