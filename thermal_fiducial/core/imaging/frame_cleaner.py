@@ -187,6 +187,8 @@ class FreezeDetector:
     # there single rows may repeat in a new frame, but not all.
     TORN = 0.25
     TORN_8_BIT = 0.999
+    # A row with a larger share of clipped pixels cannot change: no usable array has as many dead pixels as the others.
+    CLIPPED = 0.9
 
     def __init__(self) -> None:
         # Number of buffers of a driver, which may send them in turn while it gets nothing new.
@@ -210,6 +212,9 @@ def _repeated_rows(sample: Counts, earlier: Counts) -> float:
     if not same.any():
         return 0.0
     clipped = sample.max(axis=1) == sample.min(axis=1)
+    # Dead and stuck pixels stand out of a clipped row, and do not change either.
+    at_either_end = (sample == sample.min()) | (sample == sample.max())
+    clipped |= at_either_end.mean(axis=1) > FreezeDetector.CLIPPED
     return float(np.mean(same if clipped.all() else same[~clipped]))
 
 

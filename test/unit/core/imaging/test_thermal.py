@@ -219,6 +219,25 @@ def test_a_clipped_sky_is_not_frozen():
         assert camera(frame).reason == ''
 
 
+@pytest.mark.parametrize('sky', [0, 16383])
+def test_dead_pixels_before_a_clipped_sky_do_not_freeze_it(sky):
+    """Two pixels of a thousand, as an array may have, are in more than a quarter of all rows; so is a dead column."""
+    rng, camera = np.random.default_rng(9), Camera()
+    dead = rng.random((350, 640)) < 0.002
+    dead[:, 200] = True
+    stuck = rng.integers(2000, 9000, dead.sum())
+    for k in range(4):
+        frame = noisy(scene(k), rng)
+        frame[:350] = sky
+        frame[:350][dead] = stuck
+        assert camera(frame).reason == ''
+    # What is not clipped still shows a repeated frame, and one that is torn.
+    assert camera(frame).reason == FROZEN
+    torn = frame.copy()
+    torn[350:430] = noisy(scene(5.0), rng)[350:430]
+    assert camera(torn).reason == FROZEN
+
+
 # --- shutter -------------------------------------------------------------------------------------------
 
 
