@@ -59,6 +59,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     def _publish_jump(self, T_new_old: FloatArray | None) -> None:
         """Publish a replaced map, and the correction of poses with the stamp of the newest frame before it."""
         self.odometry.forget()
+        self._poses.forget()
         if T_new_old is not None:
             self._poses.late.moved(T_new_old)
             self._topics.publish_correction(T_new_old, self._poses.late.newest_ns)

@@ -112,6 +112,10 @@ class SecondCamera:
         self._waiting = pose
         return None
 
+    def forget(self) -> None:
+        """Drop the pose that waits for one of the first camera: it is in a map that was replaced."""
+        self._waiting = None
+
     def with_second(self, pose: CameraPose, prior: MotionPrior) -> CameraPose:
         """A pose of the first camera fused with the latest of the second, extrapolated by odometry."""
         waiting, self._waiting = self._waiting, None

@@ -38,6 +38,8 @@ class CameraPoses:
         self._camera: Camera | None = None
         self._second: SecondCamera | None = None
         self._locator: MarkerMapper | None = None
+        #: why the last frame of the second camera gave no pose, in words
+        self._reason = ''
         name = node.config.second_camera
         if name:
             self._second = _second_of(node.config)
@@ -52,6 +54,11 @@ class CameraPoses:
             self._locator.configure(_alone(self._config))
             if _places(self._config) != _places(before):
                 self._second = _second_of(self._config)
+
+    def forget(self) -> None:
+        """Drop what waits in a map that was replaced."""
+        if self._second is not None:
+            self._second.forget()
 
     def send(self, stamp_ns: int, pose: CameraPose | None) -> None:
         """Publish the pose of a frame of the first camera, if it has one, in the map as of its stamp."""
@@ -76,18 +83,20 @@ class CameraPoses:
             return
         self._locator.use_map_of(self._mapper)
         result = self._locator.process(*clouds.stamped_markers(message), self._camera, self._node.odometry)
+        self._reason = result.reason
         alone = None if result.pose is None else self._second.add_second(result.pose, self._node.odometry)
         if alone is not None:
             self._publish(alone)
 
     def figures(self) -> dict[str, object]:
-        """Counters of the second camera's poses, and the difference of the clocks."""
+        """Counters of the second camera's poses, why the last frame gave none, and the difference of the clocks."""
         second = self._second
         if second is None:
             return {}
         words: dict[str, object] = {'joined': second.joined, 'alone': second.alone, 'contradicted': second.contradicted}
         clock = f'{1e3 * second.clock.seconds:.1f} +- {1e3 * math.sqrt(second.clock.variance):.1f}'
-        return {f'second camera: {word}': figure for word, figure in (words | {'clock [ms]': clock}).items()}
+        more = {'no pose': self._reason, 'clock [ms]': clock}
+        return {f'second camera: {word}': figure for word, figure in (words | more).items()}
 
 
 def _places(config: MarkerMapperConfig) -> tuple[tuple[float, ...], ...]:

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
+from std_srvs.srv import Trigger
 from support import small_bag
 from support.messages import frames, info
 
@@ -16,10 +17,11 @@ from thermal_fiducial.core.detection.detector import MarkerDetector, rows_from_c
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.second_camera import intersection, SecondCamera, SecondClock, seen_from
-from thermal_fiducial.core.measurements import CameraPose, Odometry
+from thermal_fiducial.core.measurements import CameraPose, MARKER_DTYPE, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import image_to_array
+from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.replay.settings import read_settings
 from thermal_fiducial.ros.messages import clouds, convert
@@ -298,6 +300,35 @@ def test_what_the_second_camera_sees_changes_nothing_in_the_map(graph, mapper_of
     for k in range(60, 120):
         graph.send('markers', corners_in_view(small_bag.START_NS + k * 33 * MS, moved=True))
     assert not mapper_of_two.mapper.map.markers[3].trusted
+
+
+@pytest.mark.ros
+def test_what_waits_of_the_second_camera_is_not_joined_in_another_map(graph, mapper_of_two, tmp_path):
+    graph.listen(PoseWithCovarianceStamped, 'camera_pose')
+    shifted = small_bag.map_of(range(4))
+    T_new_old = transform(np.eye(3), [0.01, 0.0, 0.0])
+    for key, marker in shifted.markers.items():
+        shifted.markers[key] = replace(marker, T_map_marker=T_new_old @ marker.T_map_marker)
+    later_ns = small_bag.START_NS + 33 * MS
+    graph.send('markers', corners_in_view(small_bag.START_NS, moved=False))
+    graph.send('down/markers', corners_in_view(later_ns, moved=False))
+    save_map(mapper_of_two.config.map_file, shifted)
+    assert graph.call(Trigger, 'marker_mapper/load', Trigger.Request()).success
+    graph.send('markers', corners_in_view(later_ns, moved=False))
+    graph.spin_until(lambda: len(graph.heard['camera_pose']) == 2)
+    before, after = (convert.transform_of(message.pose.pose)[:3, 3] for message in graph.heard['camera_pose'])
+    # The corners are exact, but for their single precision.
+    np.testing.assert_allclose(after - before, T_new_old[:3, 3], atol=1e-4)
+    assert graph.diagnose(mapper_of_two)[2]['second camera: joined'] == '0'
+
+
+@pytest.mark.ros
+def test_the_diagnostics_say_why_the_second_camera_gives_no_pose(graph, mapper_of_two):
+    graph.send('down/markers', corners_in_view(small_bag.START_NS, moved=False))
+    assert graph.diagnose(mapper_of_two)[2]['second camera: no pose'] == ''
+    empty = clouds.cloud(np.zeros(0, MARKER_DTYPE), convert.header(small_bag.START_NS + 33 * MS, 'camera'))
+    graph.send('down/markers', empty)
+    assert graph.diagnose(mapper_of_two)[2]['second camera: no pose'] == 'no known marker in view'
 
 
 @pytest.mark.ros
