@@ -94,7 +94,7 @@ MECHANISMS = {
         {'located:LocatedFrame.contradicts_odometry': False},
     ),
     'odometry of keyframes': Mechanism(
-        ('chain', 'tags test_22'), (), {'keyframes:of_correlated_odometry': lambda covariance: 1e12 * covariance}
+        ('chain', 'tags test_22'), (), {'keyframes:of_followed_map': lambda information, _: 1e-12 * information}
     ),
     'bridging': Mechanism(
         ('chain', 'tags test_22'),

@@ -11,6 +11,7 @@ import numpy as np
 
 from support import real_flights, tagslam, walls
 from support.corner_runs import rms
+from support.following_filter import FollowingFilter
 from support.scenes import motion_prior
 from support.wrong_lenses import bent_corridor
 from thermal_fiducial.calibration.joint_pose import solve_camera_pose
@@ -30,11 +31,14 @@ WRONG_K1 = 0.012
 Figures = dict[str, float]
 
 
-def _mapped(mapper: MarkerMapper, frames: dict[int, Any], camera: Any, prior: Any = lambda stamp: None) -> Figures:
+def _mapped(mapper: MarkerMapper, frames: dict[int, Any], camera: Any, ekf: Any = None) -> Figures:
     """Frames through the mapper with its refinements: located, and what a frame and the refinements cost."""
     located, adjusting, begin = 0, 0.0, time.process_time()
     for stamp, rows in frames.items():
-        located += mapper.process(stamp, rows, camera, prior(stamp)).pose is not None
+        pose = mapper.process(stamp, rows, camera, None if ekf is None else ekf.prior(stamp)).pose
+        located += pose is not None
+        if ekf is not None:
+            ekf.follow(stamp, pose)
         if mapper.refinement_due(stamp):
             since = time.process_time()
             snapshot = mapper.snapshot()
@@ -209,18 +213,14 @@ def chain() -> Figures:
         row = walls.wall(rng, 4)
         poses = {i: retract(row[0], [0.0, 1.1 * i + (0.9 * (i > 4)), 0.0, 0.0, 0.0, 0.0]) for i in range(9)}
         mapper = MarkerMapper(MarkerMapperConfig(**AS_BODY), MarkerMap({0: MapMarker(0, walls.SIZE, True, poses[0])}))
-        frames, states, drift = {}, {}, np.zeros(6)
+        frames, truth = {}, {}
         for k in range(0, 600, 4):
             y = poses[0][1, 3] + 0.5 + 9.5 * k / 600
             eye = np.array([-1.6, y + 0.3 * np.sin(k / 9), 1.0 + 0.3 * np.sin(k / 14)])
             T = walls.look(eye, [0.0, y, 1.0 + 0.1 * np.sin(k / 20)])
-            drift = 0.98 * drift + rng.normal(size=6) * ([0.002] * 3 + [0.0005] * 3)
-            P = np.diag([0.01**2] * 3 + [0.0025**2] * 3)
-            twist = np.diag([0.03**2] * 3 + [0.01**2] * 3)
             stamp = walls.stamp(k)
-            frames[stamp] = walls.see(T, poses, 0.1, rng)
-            states[stamp] = motion_prior(Odometry(stamp, retract(T, drift), np.zeros(3), np.zeros(3), P, twist))
-        located.append(_mapped(mapper, frames, walls.CAMERA, states.get)['located %'])
+            frames[stamp], truth[stamp] = walls.see(T, poses, 0.1, rng), T
+        located.append(_mapped(mapper, frames, walls.CAMERA, FollowingFilter(truth, rng))['located %'])
         maps.append((mapper.map, poses))
     return {'located %': float(np.mean(located)), **_figures_of_maps(maps)}
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 
 from support import walls
-from support.scenes import motion_prior
+from support.following_filter import FollowingFilter
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.mapping.keyframes import VIEWS
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.measurements import corners_px, Odometry
+from thermal_fiducial.core.measurements import corners_px
 
 #: Waves that a function is the sum of: enough for its values to be normally distributed.
 _WAVES = 200
@@ -55,13 +55,6 @@ def _corridor(rng):
     return poses, camera
 
 
-def _odometry(stamp, T_map_camera, rng):
-    """A filter's, in the frame of the camera."""
-    off = rng.normal(size=6) * np.repeat([0.005, 0.001], 3)
-    P, twist = (np.diag(np.repeat(stds, 3)) ** 2 for stds in ([0.01, 0.0025], [0.03, 0.01]))
-    return motion_prior(Odometry(stamp, retract(T_map_camera, off), np.zeros(3), np.zeros(3), P, twist))
-
-
 def _nees(off, covariance):
     return float(off @ np.linalg.solve(covariance, off)) / 6.0
 
@@ -91,12 +84,13 @@ def _flown(seed, lens_px, frames, marker_map=None):
         # The same lens and corridor, other noise.
         rng, step = np.random.default_rng(1000 + seed), 5
     mapper = MarkerMapper(config, marker_map or MarkerMap({0: MapMarker(0, walls.SIZE, True, poses[0])}))
-    located = []
-    for k in range(0, frames, step):
-        T, stamp = camera(k), walls.stamp(k)
+    truth = {walls.stamp(k): camera(k) for k in range(0, frames, step)}
+    ekf, located = FollowingFilter(truth, rng), []
+    for k, (stamp, T) in enumerate(truth.items()):
         rows = through(lens, walls.see(T, poses, _SIGMA_PX, rng), _SIGMA_PX)
-        pose = mapper.process(stamp, rows, walls.CAMERA, _odometry(stamp, T, rng)).pose
-        if pose is not None and k > 60:
+        pose = mapper.process(stamp, rows, walls.CAMERA, ekf.prior(stamp)).pose
+        ekf.follow(stamp, pose)
+        if pose is not None and k * step > 60:
             located.append((T, pose))
         if mapper.refinement_due(stamp):
             mapper.refine(VIEWS)

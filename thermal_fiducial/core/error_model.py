@@ -55,8 +55,8 @@ class SystematicErrors:
 
 #: 99.9 % quantile of chi square with eight degrees of freedom, of a view of a marker.
 CHI2_OF_VIEW = 26.1
-#: Errors of successive odometry poses are correlated for seconds: this many count as one.
-CORRELATED_ODOMETRY = 30.0
+#: Errors of successive poses by two cameras last as long as the view, for seconds: this many count as one.
+CORRELATED_POSES = 30.0
 #: Part of the re-projection error, by bent plates and corner bias, that is no sign of an inconsistent marker [px].
 INCONSISTENT_PX = 0.3
 
@@ -191,9 +191,25 @@ def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
 # Odometry.
 
 
-def of_correlated_odometry(covariance: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of one of many successive odometry poses, as if they were independent."""
-    return CORRELATED_ODOMETRY * covariance
+def of_correlated_poses(covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of one of many successive poses by two cameras, as if they were independent."""
+    return CORRELATED_POSES * covariance
+
+
+def of_followed_map(information: FloatArray, bridges: BoolArray) -> FloatArray:
+    """Information (F, 6, 6) of keyframes by odometry that follows poses in the map: all count as one measurement.
+
+    They have the errors of the map and of the corners behind those poses in common. With the usual correlation of
+    seconds, a map from faint markers took its own error for confirmed: 2.5 degrees at a claim of 0.9.
+
+    Parameters
+    ----------
+    information : (F, 6, 6) of each, zero without odometry
+    bridges : (F,) over a gap, where the map says nothing; each counts in full
+    """
+    following = information.any(axis=(1, 2)) & ~bridges
+    number = np.where(following, np.count_nonzero(following), 1)
+    return np.asarray(information / number[:, None, None])
 
 
 # Weights of markers, and decisions between hypotheses; no published covariance has these in it.

@@ -70,7 +70,7 @@ class Snapshot:
     errors: SystematicErrors
 
     def useful(self) -> BoolArray:
-        """Which views (n,) constrain the map and are connected with a held or prior marker, or with odometry.
+        """Which views (n,) constrain the map and are connected with a held or prior marker, by markers or odometry.
 
         A keyframe needs two markers of the map, or one and odometry. Unconnected parts are not adjusted.
         """
@@ -81,10 +81,10 @@ class Snapshot:
         seen = np.unique(self.ids[useful])
         held = self.held(seen)
         by_odometry = has_odometry[self.frame]
-        reached = np.isin(self.ids, [*seen[held], *self.known]) | (by_odometry & held.any())
+        reached = np.isin(self.ids, [*seen[held], *self.known])
         while True:
             joined = useful & np.isin(self.frame, self.frame[useful & reached])
-            # Odometry connects all frames that have it, but with the map only where its frame is known.
+            # Odometry connects all frames that have it, but with the map only where one of them is.
             more = reached | np.isin(self.ids, self.ids[joined]) | (by_odometry & by_odometry[joined].any())
             if np.array_equal(more, reached):
                 return np.asarray(joined)
@@ -255,13 +255,13 @@ class MapProblem:
     def equations(self) -> NormalEquations:
         """Which keyframe is connected with which node: with markers by views, and with the frame of the odometry.
 
-        Where a marker is held, the filter's map is taken to be this one. Where none is, poses of the filter know no
-        better where the map lies than the priors that they come from: its odometry is of motion alone.
+        The filter's poses know no better where the map lies than the map that they come from: its odometry is of motion
+        alone, and the frame of it is never held.
         """
         keyframes = np.arange(len(self.stamps))
         frame = np.concatenate([self.frame, keyframes])
         node = np.concatenate([self.marker, np.full(len(keyframes), len(self.ids))])
-        return NormalEquations(frame, node, np.append(self.held, self.held.any()))
+        return NormalEquations(frame, node, np.append(self.held, False))
 
     def normal(self, now: Linearised, scale: float) -> tuple[Blocks, FloatArray, FloatArray]:
         """Normal equations, and their right sides (F, 6, 1) and (M + 1, 6, 1)."""

@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import (
     divided_prior,
     draws_of,
-    of_correlated_odometry,
+    of_followed_map,
     SystematicErrors,
 )
 from thermal_fiducial.core.geometry.camera import Camera
@@ -47,9 +47,11 @@ class Keyframe:
     corners: FloatArray
     #: (k, 4, 2, 2) [px^2]
     covariances: FloatArray
-    #: camera pose by odometry (4, 4), and its information (6, 6), zero without odometry
+    #: camera pose by odometry (4, 4), and the information (6, 6) of that one alone, zero without odometry
     T_odometry: FloatArray = field(default_factory=lambda: np.eye(4))
     information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    #: whether only odometry connects it, and markers that follow, with keyframes before: never dropped
+    bridge: bool = False
 
 
 def snapshot_of(
@@ -62,13 +64,15 @@ def snapshot_of(
     """At least one keyframe, and ``markers`` of the map to adjust, as a refinement works on them."""
     cameras = {id(frame.camera): frame.camera for frame in frames}
     places = {key: place for place, key in enumerate(cameras)}
+    information = np.stack([frame.information for frame in frames])
+    bridges = np.array([frame.bridge for frame in frames])
     return Snapshot(
         markers,
         np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
         np.stack([frame.T_map_camera for frame in frames]),
         tuple(cameras.values()),
         np.array([places[id(frame.camera)] for frame in frames]),
-        Priors(np.stack([frame.T_odometry for frame in frames]), np.stack([frame.information for frame in frames])),
+        Priors(np.stack([frame.T_odometry for frame in frames]), of_followed_map(information, bridges)),
         np.repeat(np.arange(len(frames)), [len(frame.ids) for frame in frames]),
         np.concatenate([frame.ids for frame in frames]),
         np.concatenate([frame.corners for frame in frames]),
@@ -131,8 +135,6 @@ class KeyframeStore:
         self._budget = budget
         #: by stamp
         self.frames: dict[int, Keyframe] = {}
-        #: stamps of keyframes that only odometry connects with the others: never dropped
-        self.bridges: set[int] = set()
         #: the markers of that map
         self._before = dict(marker_map.markers)
         self._adjustment = LastAdjustment(markers=len(marker_map.markers))
@@ -165,12 +167,8 @@ class KeyframeStore:
         follow in the gap, since the markers connect the later frames.
         """
         keyframe = self._keyframe(seen, predicted.pose, camera, predicted)
-        if first:
-            information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
-            self.bridges.add(keyframe.stamp_ns)
-            self.add(replace(keyframe, information=information))
-        elif len(seen.ids) >= 2:
-            self.add(keyframe)
+        if first or len(seen.ids) >= 2:
+            self.add(replace(keyframe, bridge=first))
         if self._gap is None:
             self._gap = predicted.pose
         # The error of the odometry at the gap's first marker is common to all views.
@@ -231,7 +229,7 @@ class KeyframeStore:
         frame = Keyframe(pose.stamp_ns, pose.T_map_camera, self._camera, seen.ids, seen.corners, seen.covariances)
         if predicted is None:
             return frame
-        information = np.asarray(np.linalg.inv(of_correlated_odometry(predicted.pose.covariance)), dtype=np.float64)
+        information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
         return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
 
     def _selected(self, views: int) -> tuple[Keyframe, ...]:
@@ -248,7 +246,7 @@ class KeyframeStore:
         while len(cells := self._cells(coarseness)) > room:
             coarseness *= 2.0
         share = _fair_share([len(stamps) for stamps in cells.values()], room)
-        kept = self.bridges & self.frames.keys()
+        kept = {stamp for stamp, frame in self.frames.items() if frame.bridge}
         for stamps in cells.values():
             chosen = np.linspace(0, len(stamps) - 1, min(share, len(stamps))).round().astype(int)
             kept.update(stamps[i] for i in chosen)

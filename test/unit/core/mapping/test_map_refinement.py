@@ -10,7 +10,7 @@ from support.wrong_lenses import drawn_lens
 
 from thermal_fiducial.core.error_model import covariance_of, draws_of, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference, retract
-from thermal_fiducial.core.geometry.se3 import rotation_angle, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
 from thermal_fiducial.core.mapping.adjustment_problem import MapProblem
 from thermal_fiducial.core.mapping.keyframes import Keyframe, prior_poses, snapshot_of
@@ -129,22 +129,21 @@ def test_the_schur_complement_answers_like_the_whole_system(fixed):
     # No place is known better than to 0.1 mm and mrad.
     root = np.linalg.cholesky(np.linalg.inv(covariance + 1e-8 * np.eye(6))).T
     add([(F + 1, root)], root @ difference(prior, s.markers[1].T_map_marker))
-    root = np.sqrt(information)
+    # All odometry counts as one measurement.
+    root = np.sqrt(information / len(by_odometry))
     for k, frame in by_odometry.items():
         moved = [difference(retract(np.eye(4), d) @ frame.T_odometry, frame.T_odometry) for d in STEP * np.eye(6)]
         terms = [(k, root), (F + M, -root @ np.transpose(moved) / STEP)]
         add(terms, root @ difference(frame.T_odometry, frame.T_map_camera))
-    # Where a marker is held, the odometry is known to be in the map.
-    free = np.repeat(np.concatenate([np.ones(F, dtype=bool), ~problem.held, [not fixed]]), 6)
+    free = np.repeat(np.concatenate([np.ones(F, dtype=bool), ~problem.held, [True]]), 6)
     expected = np.zeros(6 * (F + M + 1))
     expected[free] = np.linalg.solve(H[np.ix_(free, free)], g[free])
     blocks, *sides = problem.normal(e, 1.0)
     system = problem.equations.reduced(blocks)
     frames, nodes = system.solve(*sides)
-    # Two ways of solving one system of condition 1e8. Where one prior holds the map, what keeps blocks from being
-    # singular, 1e-12 of them, holds it too: by 1e-4 of a step of 4 mm.
-    atol = 1e-9 if fixed else 1e-6
-    np.testing.assert_allclose(np.concatenate([frames.ravel(), nodes.ravel()]), expected, rtol=1e-5, atol=atol)
+    # Two ways of solving one system of condition 1e8. Where one prior holds the map, or two the frame of the odometry,
+    # what keeps blocks from being singular, 1e-12 of them, holds it too: by 1e-4 of a step of 4 mm.
+    np.testing.assert_allclose(np.concatenate([frames.ravel(), nodes.ravel()]), expected, rtol=1e-5, atol=1e-6)
     inverse_H = np.linalg.inv(H[np.ix_(free, free)])
     covariances = system.covariances()
     for k, m in enumerate(np.flatnonzero(~problem.held)):
@@ -219,7 +218,9 @@ def test_odometry_carries_the_map_over_a_gap():
     drift = np.array([0.01, -0.02, 0.005, 0.002, -0.001, 0.003])
     covariance = np.diag([4e-4] * 3 + [1e-5] * 3)
     T = retract(flight(20.0 * (11 - 1) / 20), drift)
-    frames[10] = replace(frames[10], T_odometry=T, information=np.linalg.inv(covariance))
+    frames[10] = replace(frames[10], T_odometry=T, information=np.linalg.inv(covariance), bridge=True)
+    # Before the gap it follows the markers.
+    frames[9] = replace(frames[9], T_odometry=flight(20.0 * 9 / 20), information=np.linalg.inv(covariance))
     refinement = refine(replace(s, keyframes=tuple(frames)))
     assert refinement is not None
     near = [difference(refinement.markers[i].T_map_marker, poses[i]) for i in (1, 2, 3)]
@@ -352,10 +353,11 @@ def test_odometry_does_not_say_where_a_surveyed_map_lies():
         np.testing.assert_allclose(ratio, 1.0, atol=0.1)
 
 
-def test_odometry_holds_keyframes_that_a_marker_leaves_loose():
-    """A chain of pairs: each frame sees two markers, and noise turns the chain at every link."""
-    rng = np.random.default_rng(11)
-    poses = dict(list(wall(rng).items())[:4])
+def loose_and_held(rng, poses):
+    """A chain of pairs: each frame sees two markers, and noise turns the chain at every link; without odometry, with.
+
+    The odometry is off by 5 mm and 1 mrad in each frame.
+    """
     pairs = [{key: poses[key] for key in (k, k + 1)} for k in range(3)]
     frames = []
     for k in range(60):
@@ -377,12 +379,31 @@ def test_odometry_holds_keyframes_that_a_marker_leaves_loose():
         )
         for frame in frames
     ]
-    held = replace(loose, keyframes=tuple(known))
-    off = {name: errors(refine(s), poses)[:, :3] for name, s in (('loose', loose), ('held', held))}
-    assert np.sqrt(np.mean(off['held'] ** 2)) < 0.5 * np.sqrt(np.mean(off['loose'] ** 2))
-    # What is far off counts less: of a filter that is lost by half a metre less than a tenth gets into the map.
-    lost = [replace(frame, T_odometry=retract(frame.T_odometry, np.full(6, 0.5))) for frame in known]
+    return loose, replace(loose, keyframes=tuple(known))
+
+
+def test_odometry_holds_the_shape_of_a_chain():
+    off = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        poses = dict(list(wall(rng).items())[:4])
+        maps = [refine(recorded).markers for recorded in loose_and_held(rng, poses)]
+        last = inverse(poses[1]) @ poses[3]
+        off.append([difference(inverse(m[1].T_map_marker) @ m[3].T_map_marker, last) for m in maps])
+    loose, held = np.sqrt(np.mean(np.square(off), axis=0))
+    # 0.60 of positions and 0.59 of rotations over twelve seeds: half-way to 1, which is no gain.
+    assert np.linalg.norm(held[:3]) < 0.8 * np.linalg.norm(loose[:3])
+    assert np.linalg.norm(held[3:]) < 0.8 * np.linalg.norm(loose[3:])
+
+
+def test_a_filter_that_is_lost_spoils_no_map():
+    """Its motion is right, its place is not: half a metre and radian off."""
+    rng = np.random.default_rng(11)
+    poses = dict(list(wall(rng).items())[:4])
+    loose, held = loose_and_held(rng, poses)
+    lost = [replace(f, T_odometry=retract(f.T_odometry, np.full(6, 0.5))) for f in held.keyframes]
     off = errors(refine(replace(loose, keyframes=tuple(lost))), poses)[:, :3]
+    # Less than a tenth of it gets into the map.
     assert np.sqrt(np.mean(off**2)) < 0.1 * 0.5
 
 
