@@ -7,12 +7,17 @@ about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that t
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermal_fiducial.core.geometry.reprojection import turned
-from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked
+
+if TYPE_CHECKING:
+    # Not imported here: the filter uses this module, and restarts sooner without OpenCV.
+    from thermal_fiducial.core.geometry.planar_pose import PlanarPoses
 
 _F4 = '<f4'
 #: Messages older than the newest one by more than this are those of a clock that was set back, or of a bag that was
@@ -50,10 +55,11 @@ MAP_DTYPE = np.dtype(
 Markers = np.ndarray
 
 
-# All fields have four bytes, so rows can be read as a table of numbers, many times faster.
+# All fields have four bytes, so rows can be read and written as a table of numbers, many times faster.
 _COLUMN = {name: column for column, name in enumerate(_MARKER_NAMES) if name != 'id'}
 _CORNERS = [_COLUMN[name] for name in CORNER_FIELDS]
 _COVARIANCES = [_COLUMN[f'c{corner}{term}'] for corner in range(4) for term in ('uu', 'uv', 'uv', 'vv')]
+_COVARIANCE_TERMS = [_COLUMN[name] for name in CORNER_COVARIANCE_FIELDS]
 _OF_DETECTOR = [_COLUMN['detector_px']]
 _BRANCHES = [_COLUMN[f'{prefix}{name}'] for prefix in ('', 'a') for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')]
 
@@ -67,10 +73,48 @@ def columns(markers: Markers, names: tuple[str, ...]) -> FloatArray:
 
 def _numbers(markers: Markers, places: list[int]) -> FloatArray:
     """Columns (N, len(places)) of the rows, read as a table."""
-    table = np.ascontiguousarray(markers).view(_F4).reshape(len(markers), len(_MARKER_NAMES))
+    table = _table(np.ascontiguousarray(markers))
     # Invalid bytes may be a signalling NaN; it is refused later like any other NaN.
     with np.errstate(invalid='ignore'):
         return table.take(places, axis=1).astype(np.float64)
+
+
+def _table(markers: Markers) -> Float32Array:
+    """Contiguous rows as a table of numbers, all but the IDs: a view."""
+    return markers.view(_F4).reshape(len(markers), len(_MARKER_NAMES))
+
+
+def marker_rows(
+    ids: IntArray,
+    corners_px: FloatArray,
+    covariances: FloatArray,
+    poses: 'PlanarPoses',
+    contrast: FloatArray | None = None,
+) -> Markers:
+    """Rows of N markers by rising ID, without those that have no pose.
+
+    Parameters
+    ----------
+    ids : (N,)
+    corners_px, covariances : (N, 4, 2) [px], (N, 4, 2, 2) [px^2]
+    contrast : (N,) [counts], where it is known
+    """
+    rows = np.zeros(len(ids), dtype=MARKER_DTYPE)
+    table = _table(rows)
+    table[:, _CORNERS] = corners_px.reshape(-1, 8)
+    terms = covariances.reshape(-1, 4, 4)[..., [0, 1, 3]]
+    table[:, _COVARIANCE_TERMS] = terms.reshape(-1, len(_COVARIANCE_TERMS))
+    rows['sigma_px'] = np.sqrt(terms[..., [0, 2]].mean(axis=(1, 2)))
+    if contrast is not None:
+        # They are our own: all that their covariances contain are errors of the detector.
+        rows['contrast_counts'], rows['detector_px'] = contrast, rows['sigma_px']
+    positions = poses.T_camera_marker[..., :3, 3]
+    orientations = quaternion_from_rotation(poses.T_camera_marker[..., :3, :3])
+    table[:, _BRANCHES] = np.concatenate([positions, orientations], axis=-1).reshape(-1, len(_BRANCHES))
+    rows['rms_px'], rows['arms_px'] = poses.rms_px[:, 0], poses.rms_px[:, 1]
+    rows['id'] = ids
+    usable = np.flatnonzero(np.isfinite(poses.rms_px[:, 0]))
+    return np.asarray(rows[usable[np.argsort(ids[usable], kind='stable')]])
 
 
 def corners_px(markers: Markers) -> FloatArray:

@@ -18,13 +18,10 @@ from thermal_fiducial.core.detection.prediction.tracking import MotionTrack, pre
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses, solve_marker_poses
-from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
+from thermal_fiducial.core.measurements import marker_rows, Markers
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
-# All fields have four bytes, so that rows can be viewed as a table of numbers.
-_COLUMN = {name: column for column, name in enumerate(MARKER_DTYPE.names or ())}
-_NUMBER = np.dtype('<f4')
 # Contrast-to-noise ratio beyond which the array's column pattern does not displace sides.
 _CLEARER_THAN_COLUMNS = 100.0
 # Known markers wholly in view from which on partially visible ones would not improve the pose.
@@ -135,40 +132,6 @@ class MarkerDetector:
         return np.asarray(rows[np.argsort(rows['id'], kind='stable')])
 
 
-def marker_rows(
-    ids: IntArray,
-    corners_px: FloatArray,
-    covariances: FloatArray,
-    poses: PlanarPoses,
-    contrast: FloatArray | None = None,
-) -> Markers:
-    """Rows of N markers by rising ID, without those that have no pose.
-
-    Parameters
-    ----------
-    ids : (N,)
-    corners_px, covariances : (N, 4, 2) [px], (N, 4, 2, 2) [px^2]
-    contrast : (N,) [counts], where it is known
-    """
-    rows = np.zeros(len(ids), dtype=MARKER_DTYPE)
-    table = rows.view(_NUMBER).reshape(-1, len(_COLUMN))
-    table[:, _CORNERS] = corners_px.reshape(-1, 8)
-    terms = covariances.reshape(-1, 4, 4)[..., [0, 1, 3]]
-    table[:, _COVARIANCES] = terms.reshape(-1, 12)
-    rows['sigma_px'] = np.sqrt(terms[..., [0, 2]].mean(axis=(1, 2)))
-    if contrast is not None:
-        # They are our own: all that their covariances contain are errors of the detector.
-        rows['contrast_counts'], rows['detector_px'] = contrast, rows['sigma_px']
-    positions = poses.T_camera_marker[..., :3, 3]
-    orientations = se3.quaternion_from_rotation(poses.T_camera_marker[..., :3, :3])
-    table[:, _POSITION], table[:, _OTHER_POSITION] = positions[:, 0], positions[:, 1]
-    table[:, _ORIENTATION], table[:, _OTHER_ORIENTATION] = orientations[:, 0], orientations[:, 1]
-    rows['rms_px'], rows['arms_px'] = poses.rms_px[:, 0], poses.rms_px[:, 1]
-    rows['id'] = ids
-    usable = np.flatnonzero(np.isfinite(poses.rms_px[:, 0]))
-    return np.asarray(rows[usable[np.argsort(ids[usable], kind='stable')]])
-
-
 def rows_from_corners(
     ids: IntArray, corners: FloatArray, covariances: FloatArray, sizes: FloatArray, camera: Camera
 ) -> Markers:
@@ -180,12 +143,3 @@ def rows_from_corners(
     corners, covariances : (N, 4, 2) [px], (N, 4, 2, 2) [px^2]
     """
     return marker_rows(ids, corners, covariances, solve_marker_poses(corners, covariances, sizes, camera))
-
-
-def _between(first: str, last: str) -> slice:
-    return slice(_COLUMN[first], _COLUMN[last] + 1)
-
-
-_CORNERS, _COVARIANCES = _between('u0', 'v3'), _between('c0uu', 'c3vv')
-_POSITION, _ORIENTATION = _between('x', 'z'), _between('qx', 'qw')
-_OTHER_POSITION, _OTHER_ORIENTATION = _between('ax', 'az'), _between('aqx', 'aqw')
