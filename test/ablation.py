@@ -166,6 +166,10 @@ def _nothing_found(*_: Any) -> Any:
     return _place('prediction.known_markers:FoundMarkers').none()
 
 
+def _by_optics_alone(corners_px: Any, cells: int, blur_px: float, *_: Any, **__: Any) -> Any:
+    return _place('corners.pattern_fit:too_small_for_sides')(corners_px, cells, blur_px)
+
+
 def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
     none = np.zeros(len(seen))
     return _place('corners.squares:Squared')(seen, covariance, none, none, none)
@@ -184,18 +188,11 @@ MECHANISMS = {
     'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_INCONSISTENT': np.inf}),
     'passes until settled': Mechanism('fast, 8 K, blind', (), {'corners.side_fit:_PASSES': 1}),
     'second round': Mechanism('fast, 8 K, blind', (), {'corners.refining:_ROUNDS': 1}),
-    'edges behind the sides': Mechanism(
-        'fast, 8 K, blind',
-        ('corners.sides:_of_cells',),
-        {'corners.sides:_NARROW': 0.0},
-    ),
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
     'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'prediction.frame:_HARDLY_PX': np.inf}),
-    'ends of motion blur': Mechanism(
-        'fast, 8 K, guided',
-        ('prediction.frame:_moments', 'prediction.frame:_halves'),
-        {'corners.side_fit:WITHOUT_TAIL': _place('corners.sides:ONE_GAUSSIAN')},
+    'whole patterns in motion blur': Mechanism(
+        'fast, 8 K, guided', (), {'corners.refining:are_fitted_whole': _by_optics_alone}
     ),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(

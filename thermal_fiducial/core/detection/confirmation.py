@@ -27,7 +27,7 @@ from thermal_fiducial.core.detection.corners.corner_errors import (
 from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.corners.refining import RefinedMarkers
 from thermal_fiducial.core.detection.corners.segments import measure, REACHED, Segments, UNMEASURED
-from thermal_fiducial.core.detection.corners.sides import blur_of, edges_behind_border, model, sides_of
+from thermal_fiducial.core.detection.corners.sides import blur_of, free_distance, model, sides_of, white_behind_border
 from thermal_fiducial.core.detection.finding.quads import halfway, halved
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
 from thermal_fiducial.core.detection.prediction.frame import counts_of, Frame, MotionBlur
@@ -93,7 +93,7 @@ class DisplayedSides:
     """Corrects corners for the displacement of sides in pictures for a display; markers with ``bits`` (M, n, n)."""
 
     def __init__(self, bits: Gray) -> None:
-        self._behind, self._white = edges_behind_border(bits)
+        self._white = white_behind_border(bits)
         self._bits = bits.shape[1]
 
     def corrected(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> RefinedCorners:
@@ -129,10 +129,11 @@ class DisplayedSides:
         inner = np.moveaxis(se3.seen_between(at.x, se3.bilinear(a, b)), 0, -1)
         sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _WIDEST_PX)
         blur = blur_of(sides, blur_px, refined.blur.spread)
-        modelled = model(sides, self._behind[refined.ids], blur)
+        free = free_distance(sides, blur.across)
+        modelled = model(sides, blur, free, free)
         counting = modelled.counting & self._white[refined.ids].reshape(-1, self._bits)
         counts = counts_of(sides.pixel, frame.image, refined.blur.to_tails)
-        return measure(counts, modelled._replace(counting=counting), REACHED * blur.width)
+        return measure(counts, modelled._replace(counting=counting), REACHED * blur.across)
 
 
 def _normals(corners: FloatArray) -> FloatArray:

@@ -7,7 +7,6 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.detection.confirmation import confirmed, DisplayedSides
 from thermal_fiducial.core.detection.corners.refining import refine
-from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.detection.finding.finder import FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.partial.partial_markers import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, Dictionary
@@ -44,7 +43,6 @@ class MarkerDetector:
         overrides = size_overrides(config.marker_size_overrides)
         self._sizes = np.array([overrides.get(key, config.marker_size) for key in range(decoder.count)])
         self._finder = MarkerFinder(decoder)
-        self._behind = edges_behind(bits)
         self._displayed = DisplayedSides(bits)
         self._partial = PartialMarkerSearch(decoder, bits)
         self._known = KnownMarkers({}, self._sizes)
@@ -92,7 +90,7 @@ class MarkerDetector:
         if T_camera_map is not None and len(known.ids) and config.guided:
             expected = known.expected(T_camera_map, camera, config.min_side_px)
         found, history = self._finder.find(frame, history, known, expected, config)
-        refined = refine(frame, found, self._behind[found.ids], history.track, self._decoder, config)
+        refined = refine(frame, found, history.track, self._decoder, config)
         refined = confirmed(frame, found, refined, self._decoder, self._displayed, config)
         ids, corners = refined.ids, refined.corners
         at = refined.places.at.at_pixels(corners.corners_px)

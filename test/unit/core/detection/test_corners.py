@@ -7,7 +7,6 @@ from support.lens_planes import plane_points
 
 from thermal_fiducial.core.detection.corners.corner_errors import OF_SIDES_PX
 from thermal_fiducial.core.detection.corners.side_fit import refine_corners
-from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
@@ -21,7 +20,7 @@ CAMERAS = {
     'equidistant': Camera(640, 512, K, 'equidistant', [-0.12, -0.016, 0.0055, 0.0019]),
 }
 BITS = load_dictionary('DICT_4X4_50').bits
-BEHIND = edges_behind(BITS)
+CELLS = BITS.shape[2] + 2
 SAMPLES = 8
 BLUR = 0.6
 # Optics, and the pixel's own square over which the drawing averages.
@@ -57,12 +56,11 @@ def marker_pose(distance, tilt, u=0.1, v=-0.1):
 
 
 def refine(image, corners, camera, marker_id, **options):
-    ids = [marker_id]
     return refine_corners(
         image.astype(np.float32),
         ImagePoints.at(corners[None], camera),
         camera,
-        BEHIND[ids],
+        CELLS,
         BLUR_WITH_PIXEL,
         **options,
     )
@@ -243,7 +241,7 @@ def test_markers_do_not_disturb_each_other():
     image = np.minimum(*images).astype(np.float32)
     ids = [marker_id for marker_id, _ in scenes]
     start = np.stack(corners) + 0.3
-    both = refine_corners(image, ImagePoints.at(start, camera), camera, BEHIND[ids], BLUR_WITH_PIXEL)
+    both = refine_corners(image, ImagePoints.at(start, camera), camera, CELLS, BLUR_WITH_PIXEL)
     for index, marker_id in enumerate(ids):
         alone = refine(image, start[index], camera, marker_id)
         np.testing.assert_allclose(both.corners_px[index], alone.corners_px[0], atol=1e-6)
@@ -361,9 +359,8 @@ def test_outlines_that_are_no_markers_stay_finite():
     centres = rng.uniform(20.0, [620.0, 490.0], (400, 1, 2))
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     outlines = centres + rng.uniform(6.0, 20.0, (400, 1, 1)) * square + rng.uniform(-3.0, 3.0, (400, 4, 2))
-    ids = rng.integers(0, 50, 400)
     start = ImagePoints.at(outlines, camera)
     # Where arithmetic is invalid it warns, and warnings are errors here.
-    refined = refine_corners(image.astype(np.float32), start, camera, BEHIND[ids], BLUR_WITH_PIXEL)
+    refined = refine_corners(image.astype(np.float32), start, camera, CELLS, BLUR_WITH_PIXEL)
     assert np.isfinite(refined.corners_px).all()
     assert np.isfinite(refined.covariances).all()

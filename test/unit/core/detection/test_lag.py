@@ -6,9 +6,9 @@ import pytest
 from support import approach
 from support.detector_scores import odometry_before
 
-from thermal_fiducial.core.detection.corners.corner_errors import of_motion_blur, unknown_motion
-from thermal_fiducial.core.detection.corners.side_fit import refine_corners
-from thermal_fiducial.core.detection.corners.sides import edges_behind
+from thermal_fiducial.core.detection.corners.blurred_patterns import PatternView
+from thermal_fiducial.core.detection.corners.corner_errors import OF_LAG_FORM, of_motion_blur, unknown_motion
+from thermal_fiducial.core.detection.corners.pattern_fit import are_fitted_whole, fit_patterns
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.prediction.frame import (
     counts_of,
@@ -180,11 +180,12 @@ def test_lag_of_a_marker_that_grows_is_removed_though_its_centre_stays():
 
 
 @pytest.mark.parametrize('lag_blur', [(10.0, 0.0), (-8.0, 5.0)])
-def test_sides_are_right_where_motion_blur_is_longer_than_cells(lag_blur):
+def test_corners_are_right_where_motion_blur_is_longer_than_cells(lag_blur):
     """A marker with cells of 5 px, which lag displaces by 10 px in the mean."""
     fine, cell, place = 8, 5, 100
-    bits = load_dictionary('DICT_4X4_50').bits[[13]]
-    pattern = np.kron(np.pad(np.pad(bits[0], 1), 1, constant_values=1), np.ones((cell * fine, cell * fine)))
+    decoder, marker_id = Decoder(load_dictionary('DICT_4X4_50').bits), np.array([13])
+    pattern = decoder.patterns(marker_id, np.zeros_like(marker_id))[0]
+    pattern = np.kron(np.pad(pattern, 1, constant_values=1), np.ones((cell * fine, cell * fine)))
     scene = np.pad(pattern.astype(np.float32), place * fine)
     # The response at some ages, evenly spread in what they weigh.
     ages = -np.log(1.0 - (np.arange(400) + 0.5) / 400)
@@ -196,12 +197,12 @@ def test_sides_are_right_where_motion_blur_is_longer_than_cells(lag_blur):
     lag = np.broadcast_to(lag_blur, corners.shape)
     there = corners + REMAINING * lag
     motion = MotionBlur(lag_tail_maps(there, lag), REMAINING * lag, (1.0 - REMAINING) * lag, SPREAD * lag[:, 0])
-    camera = Camera(size, size, np.array([[500.0, 0.0, 120.0], [0.0, 500.0, 120.0], [0.0, 0.0, 1.0]]))
-    start = ImagePoints.at(there, camera)
-    behind = edges_behind(bits)
-    refined = refine_corners(1000.0 * image, start, camera, behind, np.hypot(0.6, 12**-0.5), motion=motion)
-    # With one Gaussian for the motion blur 0.30 and 0.16 px, when written 0.016 and 0.083 px.
-    assert np.sqrt(np.mean(np.square(refined.corners_px - there))) < 0.1
+    blur_px = np.hypot(0.6, 12**-0.5)
+    assert are_fitted_whole(there, decoder.cells, blur_px, motion, displayed=False)
+    view = PatternView(1000.0 * image, motion.to_tails, motion.spread)
+    fit = fit_patterns(view, there + 0.5, marker_id, decoder, blur_px)
+    # When written 0.11 and 0.10 px, as motion blur has ends and is fitted as a Gaussian: no more than what is claimed.
+    assert np.sqrt(np.mean(np.square(fit.corners_px - there))) < OF_LAG_FORM * np.hypot(*lag_blur)
 
 
 def moved(image, displacement):

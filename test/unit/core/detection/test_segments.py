@@ -7,14 +7,13 @@ import pytest
 from support.close_views import BITS, BLUR_WITH_PIXEL, CAMERAS, draw, plate, pose
 
 from thermal_fiducial.core.detection.corners.segments import adjust, measure, median_of, robust_fit, UNMEASURED
-from thermal_fiducial.core.detection.corners.sides import blur_of, edges_behind, model, sides_of
+from thermal_fiducial.core.detection.corners.sides import blur_of, free_distance, model, sides_of
 from thermal_fiducial.core.detection.prediction.frame import counts_of
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import marker_corners
 
 CAMERA, ID, CONTRAST, NOISE = CAMERAS['plumb_bob'], 7, 200.0, 8.0
-BEHIND = edges_behind(BITS)
-CELLS, REACH = BEHIND.shape[2], 1.5
+CELLS, REACH = BITS.shape[2] + 2, 1.5
 T = pose(90, 0.05, -0.05, (0.3, -0.25, 0.4))
 IMAGE = 7000.0 + CONTRAST * draw(CAMERA, plate(ID), T, samples=8)
 CORNERS = CAMERA.project(se3.apply(T, marker_corners(0.3)))
@@ -39,8 +38,8 @@ class Measured:
         self.sides = sides_of(x, CAMERA, IMAGE.shape, CELLS, 6, BLUR_WITH_PIXEL)
         blur = blur_of(self.sides, BLUR_WITH_PIXEL, np.zeros((1, 2)))
         counts = counts_of(self.sides.pixel, image.astype(np.float32))
-        modelled = model(self.sides, BEHIND[[ID]], blur)
-        self.segments = measure(counts, modelled, np.full_like(blur.width, REACH))
+        free = free_distance(self.sides, blur.across)
+        self.segments = measure(counts, model(self.sides, blur, free, free), np.full_like(free, REACH))
 
 
 @pytest.mark.parametrize('off', [(0.0, 0.0), (0.4, -0.3), (-0.6, 0.5)])

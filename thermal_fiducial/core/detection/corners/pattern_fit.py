@@ -35,7 +35,7 @@ from thermal_fiducial.core.detection.corners.corner_errors import (
 from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.prediction.frame import Frame
+from thermal_fiducial.core.detection.prediction.frame import Frame, MotionBlur
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.se3 import diagonals, sides_px, squared_sides, widths
@@ -46,6 +46,9 @@ _FALSE_MARKERS = 0.01
 # Width of cells, in blurs of the optics, below which whole patterns are fitted: at 7 a frame of 45 markers would take
 # twice the time.
 _NARROW = 6.0
+# The same in blurs of optics and motion together: at 6 a fast frame takes a third longer, and a wrong time constant of
+# the bolometers displaces corners more.
+_NARROW_IN_MOTION = 4.5
 # The same in pictures for a display, where only the whole pattern shows what gain control makes of its edges. Behind
 # smoke, fits of patterns with cells of 13 to 17 blurs are worse than those of sides, whose contrast is local.
 _NARROW_ON_DISPLAYS = 11.0
@@ -138,25 +141,20 @@ def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> B
 
     Of a marker that is turned away the cells are narrow along one direction only, and that is what counts.
     """
-    return _have_cells_below(_NARROW, corners_px, cells, blur_px)
+    return np.asarray(widths(corners_px) < _NARROW * blur_px * cells)
 
 
 def are_fitted_whole(
-    corners_px: FloatArray, cells: int, blur_px: float, lag: FloatArray, *, displayed: bool
+    corners_px: FloatArray, cells: int, blur_px: float, motion: MotionBlur, *, displayed: bool
 ) -> BoolArray:
-    """Which markers (N, 4, 2) are refined by their whole patterns: small ones, and larger ones on a display.
+    """Which markers (N, 4, 2) are refined by their whole patterns: small or blurred ones, and larger ones on displays.
 
-    There their blur by ``lag`` (N, 2) [px] counts as well: edges of a pattern that lag behind show together what gain
-    control makes of them.
+    There lag tails count as blur as well: edges of a pattern that lag behind show together what gain control makes of
+    them.
     """
-    if displayed:
-        blurs_px = np.hypot(blur_px, np.hypot(*lag.T))
-        return _have_cells_below(_NARROW_ON_DISPLAYS, corners_px, cells, blurs_px)
-    return _have_cells_below(_NARROW, corners_px, cells, blur_px)
-
-
-def _have_cells_below(blurs: float, corners_px: FloatArray, cells: int, blur_px: float | FloatArray) -> BoolArray:
-    return np.asarray(widths(corners_px) < blurs * blur_px * cells)
+    limit, of_motion = (_NARROW_ON_DISPLAYS, motion.lag) if displayed else (_NARROW_IN_MOTION, motion.spread)
+    blurs_px = np.hypot(blur_px, np.hypot(*of_motion.T))
+    return np.asarray(widths(corners_px) < np.maximum(_NARROW * blur_px, limit * blurs_px) * cells)
 
 
 def fitted_patterns(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.core.detection.corners.segments import Segments
-from thermal_fiducial.core.detection.corners.sides import EdgeModel, reaches, Sides
+from thermal_fiducial.core.detection.corners.sides import EdgeModel, free_distance, Sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Stacked
 
 # Distance from the sides [blurs] beyond which pixels do not count where a gradient of temperature displaces a side: it
@@ -51,8 +51,8 @@ class Reach(Stacked):
 
     def limits(self, sides: Sides, width: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Distances (E, m) inside and outside the sides up to which pixels count, for blur of ``width`` (E, m) [px]."""
-        inward, outward = reaches(sides, width)
-        return np.minimum(inward, self.inside.reshape(-1, 1)), np.minimum(outward, self.outside.reshape(-1, 1))
+        free = free_distance(sides, width)
+        return np.minimum(free, self.inside.reshape(-1, 1)), np.minimum(free, self.outside.reshape(-1, 1))
 
     def nearer(self, uneven: BoolArray, ending: BoolArray, outward: FloatArray, width: FloatArray) -> 'Reach':
         """The same with near pixels alone for ``uneven`` markers (N,), and less at ``ending`` sides (N, 4).

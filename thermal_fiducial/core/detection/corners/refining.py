@@ -5,8 +5,8 @@ The camera's twist gives the motion blur of each marker. Where it is large, the 
 subtracted from the corners. The corners then correct the twist; if that changes the blur much, the refinement is
 repeated.
 
-Corners are those of the fitted sides (:mod:`side_fit`), or of the whole pattern where markers are small, or not large
-in a picture for a display (:mod:`pattern_fit`).
+Corners are those of the fitted sides (:mod:`side_fit`), or of the whole pattern where cells are narrow for their blur,
+or not wide in a picture for a display (:mod:`pattern_fit`).
 """
 
 from dataclasses import dataclass, replace
@@ -33,7 +33,7 @@ from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
 from thermal_fiducial.core.detection.prediction.twist import Twist, UNKNOWN_TWIST
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.se3 import sides_px
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked, TINY
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked, TINY
 
 #: Contrast-to-noise ratio above which a marker is clear: it is found at full and at half resolution.
 CLEAR_CNR = 20.0
@@ -69,7 +69,6 @@ class RefinedMarkers(Stacked):
 def refine(
     frame: Frame,
     found: FoundMarkers,
-    behind: Float32Array,
     track: MotionTrack,
     decoder: Decoder,
     config: ArucoDetectorConfig,
@@ -78,9 +77,8 @@ def refine(
 
     Parameters
     ----------
-    behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
     track : motion and markers of the last frame, which with the corners give the twist
-    decoder : of the dictionary, for markers that are refined by their whole patterns
+    decoder : of the dictionary
     """
     if len(found.ids) == 0:
         return RefinedMarkers.none(frame)
@@ -90,12 +88,12 @@ def refine(
     for _ in range(_ROUNDS):
         blur = motion_blur(frame, places, twist)
         start = places.at.at_pixels(places.at.px + blur.shift)
-        by_pattern = are_fitted_whole(start.px, decoder.cells, config.blur_px, blur.lag, displayed=frame.displayed)
+        by_pattern = are_fitted_whole(start.px, decoder.cells, config.blur_px, blur, displayed=frame.displayed)
         if by_pattern.any():
-            refined = _with_patterns(frame, found, start, blur, behind, columns, by_pattern, decoder, config)
+            refined = _with_patterns(frame, found, start, blur, columns, by_pattern, decoder, config)
         else:
-            refined = refine_corners(frame.image, start, frame.camera, behind, config.blur_px, columns, blur)
-        markers = _at_stamp(frame, found.ids, places, blur, refined, twist, track, behind.shape[2])
+            refined = refine_corners(frame.image, start, frame.camera, decoder.cells, config.blur_px, columns, blur)
+        markers = _at_stamp(frame, found.ids, places, blur, refined, twist, track, decoder.cells)
         change = np.abs(markers.corners.corners_px - refined.corners_px + blur.shift)
         if markers.twist is None or change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX:
             break
@@ -108,7 +106,6 @@ def _with_patterns(
     found: FoundMarkers,
     start: ImagePoints,
     blur: MotionBlur,
-    behind: Float32Array,
     columns: int,
     by_pattern: BoolArray,
     decoder: Decoder,
@@ -123,7 +120,7 @@ def _with_patterns(
     if by_pattern.all():
         return fitted
     others, of_sides = start.only(by_sides), blur.only(by_sides)
-    refined = refine_corners(frame.image, others, frame.camera, behind[by_sides], config.blur_px, columns, of_sides)
+    refined = refine_corners(frame.image, others, frame.camera, decoder.cells, config.blur_px, columns, of_sides)
     order = np.argsort(np.concatenate([np.flatnonzero(by_sides), np.flatnonzero(by_pattern)]))
     return refined.joined(fitted).only(order)
 

@@ -25,13 +25,12 @@ from thermal_fiducial.core.detection.corners.sides import (
     blur_of,
     EdgeModel,
     model,
-    ONE_GAUSSIAN,
     Sides,
     sides_of,
 )
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.corners.uneven_contrast import freed_of_unevenness
-from thermal_fiducial.core.detection.prediction.frame import counts_of, MotionBlur, WITHOUT_TAIL
+from thermal_fiducial.core.detection.prediction.frame import counts_of, MotionBlur
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -50,7 +49,7 @@ def refine_corners(
     image: Float32Array,
     corners: ImagePoints,
     camera: Camera,
-    behind: Float32Array,
+    cells: int,
     blur_px: float,
     columns: int = OF_CLEAR,
     motion: MotionBlur | None = None,
@@ -63,36 +62,34 @@ def refine_corners(
     ----------
     image : (height, width) counts
     corners : (N, 4) initial values, accurate to two pixels or a third of a cell
-    behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
+    cells : m along a side
     blur_px : standard deviation of optics and pixel
     columns : of pixels, in a segment
     motion : blur by motion; none when left out
     reach : which pixels count; all that the cells allow when left out
     """
     motion = motion or MotionBlur.none(len(corners.px))
-    # Where lag tails stay, the blur is so small that it hardly differs from one Gaussian.
-    parts = ONE_GAUSSIAN if motion.to_tails is None else WITHOUT_TAIL
     motion_px = np.hypot(motion.spread[:, 0], motion.spread[:, 1])
     widest = math.hypot(blur_px, motion_px.max())
-    sides = sides_of(corners.x, camera, image.shape, behind.shape[2], columns, widest)
-    blur = blur_of(sides, blur_px, motion.spread, parts)
+    sides = sides_of(corners.x, camera, image.shape, cells, columns, widest)
+    blur = blur_of(sides, blur_px, motion.spread)
     counts = counts_of(sides.pixel, image, motion.to_tails)
     reach = reach or Reach.everywhere(len(corners.px))
-    limits = reach.limits(sides, blur.width)
-    modelled, outward = model(sides, behind, blur, limits), sides.within_columns(limits[1])
+    inside, outside = reach.limits(sides, blur.across)
+    modelled, outward = model(sides, blur, inside, outside), sides.within_columns(outside)
     measured, displaced_px = _measured(counts, modelled, sides, blur, outward, motion_px)
     segments, shows = with_gradients(measured, sides, widest)
     refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)), displaced_px)
     if passes == 1:
         return refined
-    ending = ending_sides(counts, modelled, sides, measured, outward, blur.width, motion_px)
+    ending = ending_sides(counts, modelled, sides, measured, outward, blur.across, motion_px)
     shifts = refined.corners_px - corners.px
-    which, reach = _again(moving, shows, ending, shifts, reach, outward, blur.width)
+    which, reach = _again(moving, shows, ending, shifts, reach, outward, blur.across)
     if len(which) == 0:
         return refined
     start = corners.only(which).at_pixels(refined.corners_px[which])
     again = refine_corners(
-        image, start, camera, behind[which], blur_px, columns, motion.only(which), passes - 1, reach.only(which)
+        image, start, camera, cells, blur_px, columns, motion.only(which), passes - 1, reach.only(which)
     )
     return refined.with_others(which, again)
 
@@ -134,14 +131,14 @@ def _measured(
     motion_px: FloatArray,
 ) -> tuple[Segments, FloatArray]:
     """Segments of N markers as if their contrast were even, and what its slope may displace sides by (N,) [px]."""
-    segments = measure(counts, modelled, REACHED * blur.width)
+    segments = measure(counts, modelled, REACHED * blur.across)
     displaced_px = segments.displaced_by_slopes()
     # Where sides have larger errors anyway, the correction is not worth its own.
     used = segments.variance < UNMEASURED
     noise = median_of(segments.variance, used)[:, 0] / sides.across.shape[1]
     which = displaced_px**2 > OF_ALL_SIDES_PX**2 + (OF_LAG_FORM * motion_px) ** 2 + noise
     if which.any():
-        segments = freed_of_unevenness(segments, used & which[:, None], sides, outward, blur.width)
+        segments = freed_of_unevenness(segments, used & which[:, None], sides, outward, blur.across)
     return segments, displaced_px
 
 

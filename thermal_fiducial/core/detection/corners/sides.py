@@ -2,7 +2,7 @@
 
 A side is straight in normalised image coordinates and slightly curved in the raw image. It is sampled by columns of
 whole pixels, or by rows if these cross it at a larger angle. Pixels are not interpolated, so their noise stays white.
-The model of a column is a blurred step from white to black, plus the nearest parallel edges inside the marker.
+The model of a column is a blurred step from white to black. It ends before the next edge inside the marker.
 """
 
 from dataclasses import dataclass
@@ -25,34 +25,23 @@ NODES = np.linspace(0.0, 1.0, 5)
 _REACHES, _SHORTEST, _LONGEST = 2.5, 4, 10
 # Pixels of the image needed on both sides of a side; largest distance of a curve beyond its nodes [px].
 _BOTH_SIDES, _BEYOND_NODES = 3, 3.0
-#: Parallel edges in the model, by their distance from the side [cells].
-NEIGHBOURS = (1, 2)
-# Width of cells, in blurs, below which pixels near parallel edges are needed, and the model contains these edges. It is
-# motion that blurs so much: where the optics do, whole patterns are fitted.
-_NARROW = 5.0
 # Approximation of the normal distribution by a hyperbolic tangent, good to 2e-4 (E. Page, "Approximations to the
 # cumulative normal function and its inverse for use on a pocket calculator", 1977).
 _LINEAR = 0.7988
 _CUBIC = 0.04417 * _LINEAR
-# The plate ends one cell outside, at an edge that is not in the model: distance from it that is left out [blurs].
-_PLATE_EDGE_SHOWS = 1.5
+# The next edges inside the marker, and the end of the plate one cell outside, are not in the model: distance from them
+# that is left out [blurs].
+_EDGE_SHOWS = 2.0
 # Least share of the side's step in a column: it falls off at the ends of the side.
 _MOSTLY = 0.7
-#: Mean and standard deviation (1, 2) of blur that is one Gaussian, in that blur.
-ONE_GAUSSIAN = np.array([[0.0, 1.0]])
 
 
 class Blur(NamedTuple):
-    """Blur of sides by P Gaussians of equal weight [px]."""
+    """Blur of sides [px]."""
 
-    #: (P, E, m) and (P, E, 1) standard deviations across and along the sides
+    #: (E, m) and (E, 1) standard deviations across and along the sides
     across: FloatArray
     along: FloatArray
-    #: (P, E, m) displacement inward, and (P, E, 1) along the sides from their starts to their ends
-    inward: FloatArray
-    onward: FloatArray
-    #: (E, m) standard deviation of all together across the sides
-    width: FloatArray
 
 
 class EdgeModel(NamedTuple):
@@ -194,73 +183,26 @@ def _seen(
     return fresh, (place >= 0.0) & (place <= far)
 
 
-def edges_behind(bits: Gray) -> Float32Array:
-    """Change of value, 0 black and 1 white, across the edges behind the sides of markers with ``bits`` (M, n, n).
-
-    Returns
-    -------
-    (M, 4, m, 2) for the sides of :mod:`sides`, the m = n + 2 cells along each, and edges one and two cells inward.
-    """
-    return _changes(_inward(np.pad(bits.astype(np.float32), ((0, 0), (1, 1), (1, 1)))))
+def white_behind_border(bits: Gray) -> BoolArray:
+    """Whether cells (M, 4, n) behind the borders of markers with ``bits`` (M, n, n) are white, side by side."""
+    return np.stack([bits[:, 0], bits[:, -1], bits[:, :, 0], bits[:, :, -1]], axis=1) > 0
 
 
-def edges_behind_border(bits: Gray) -> tuple[Float32Array, BoolArray]:
-    """The same behind the inner edges of the border, those of n cells a side, as if black lay behind them too.
-
-    Returns
-    -------
-    (M, 4, n, 2), and whether white lies behind them (M, 4, n), so that they are seen: as rises where sides are falls
-    """
-    inward = _inward(bits.astype(np.float32))
-    return -_changes(inward), inward[:, :, 0] > 0.5
-
-
-def _inward(grid: Float32Array) -> Float32Array:
-    """Values (M, 4, n, m) of grids (M, m, m) by side, cells inward and cells along."""
-    turned = np.swapaxes(grid, 1, 2)
-    return np.stack([grid, grid[:, ::-1], turned, turned[:, ::-1]], axis=1)[:, :, : len(NEIGHBOURS) + 1]
-
-
-def _changes(inward: Float32Array) -> Float32Array:
-    return np.ascontiguousarray(np.moveaxis(np.diff(inward, axis=2), 2, 3))
-
-
-def blur_of(sides: Sides, optics: float, motion: FloatArray, parts: FloatArray = ONE_GAUSSIAN) -> Blur:
-    """Blur of the sides of N markers by optics [px] and a motion (N, 2) [px].
-
-    ``parts`` (P, 2): mean and standard deviation of the Gaussians that make up the blur by motion, in that motion.
-    """
+def blur_of(sides: Sides, optics: float, motion: FloatArray) -> Blur:
+    """Blur of the sides of N markers by optics [px] and a motion (N, 2) [px]."""
     span = sides.ends[:, 1] - sides.ends[:, 0]
     by_side = np.repeat(motion, len(span) // len(motion), axis=0)
     across = (sides.normal @ by_side[..., None])[..., 0]
     along = (span * by_side).sum(axis=1, keepdims=True) / sides.along
-    mean, spread = parts.T[..., None, None]
-    return Blur(
-        np.hypot(optics, spread * across),
-        np.hypot(optics, spread * along),
-        mean * across,
-        mean * along,
-        np.hypot(optics, across),
-    )
+    return Blur(np.hypot(optics, across), np.hypot(optics, along))
 
 
-def model(
-    sides: Sides, behind: Float32Array, blur: Blur, limits: tuple[FloatArray, FloatArray] | None = None
-) -> EdgeModel:
-    """Model of the sides of markers, with the parallel edges behind them where these are near.
-
-    Parameters
-    ----------
-    behind : (N, 4, m, 2) of :func:`edges_behind`
-    blur : of the sides
-    limits : (E, m) each, inside and outside; those of :func:`reaches` when left out
-    """
-    cells = behind.shape[2]
-    overlapping = sides.across < cells * _NARROW * blur.width
-    edges, which = behind.reshape(-1, cells, len(NEIGHBOURS)), np.flatnonzero(overlapping.any(axis=1))
-    modelled = _blurred_sides(sides, edges, which, blur)
-    value, slope, own = (each[0] if len(each) == 1 else each.mean(axis=0) for each in modelled)
-    inward, outward = limits or reaches(sides, blur.width)
+def model(sides: Sides, blur: Blur, inward: FloatArray, outward: FloatArray) -> EdgeModel:
+    """Model of the sides of markers; ``inward``, ``outward`` (E, m): distances up to which pixels count [px]."""
+    z = np.array([sides.t, 1.0 - sides.t], dtype=np.float32) * (sides.along / blur.along).astype(np.float32)
+    # Blurred along the side, the share (C, E, m) of the step is less than 1 near the ends.
+    own = np.asarray(0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0), dtype=np.float32)
+    value, slope = blurred_step(sides.distance, (1.0 / blur.across).astype(np.float32), -own)
     counting: BoolArray = np.asarray(sides.distance >= -outward.astype(np.float32))
     counting &= sides.distance <= inward.astype(np.float32)
     counting &= sides.fresh & (own > _MOSTLY)
@@ -269,46 +211,9 @@ def model(
     return EdgeModel(value, slope, counting)
 
 
-def reaches(sides: Sides, width: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distances (E, m) inside and outside the sides up to which pixels count, for blur of ``width`` (E, m) [px]."""
-    cell = sides.across / sides.across.shape[1]
-    inward = np.where(cell < _NARROW * width, cell, cell - 2.0 * width)
-    return inward, np.minimum(inward, np.maximum(cell - _PLATE_EDGE_SHOWS * width, 0.0))
-
-
-def _blurred_sides(
-    sides: Sides, behind: Float32Array, overlapping: IntArray, blur: Blur
-) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """By each Gaussian: value and derivative of every pixel, (P, M, C, E, m), and the step's share in every column.
-
-    Parameters
-    ----------
-    behind : (E, m, 2) change of value across the edges behind the sides
-    overlapping : indices of the sides whose parallel edges are in the model
-    """
-    distance = sides.distance - blur.inward.astype(np.float32)[:, None, None]
-    sharpness = (1.0 / blur.across).astype(np.float32)[:, None]
-    t = (sides.t - (blur.onward / sides.along)[:, None]).astype(np.float32)
-    ends = (sides.along / blur.along).astype(np.float32)[:, None]
-    # Blurred along the side, the share (P, C, E, m) is less than 1 near the ends.
-    z = np.array([t, 1.0 - t]) * ends
-    own = np.asarray(0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0), dtype=np.float32)
-    value, slope = blurred_step(distance, sharpness[:, None], -own[:, None])
-    if len(overlapping):
-        distance, sharpness = distance[..., overlapping, :], sharpness[:, None, :, overlapping]
-        amounts = _of_cells(t[:, :, overlapping], ends[:, :, overlapping]) @ behind[overlapping]
-        for index, number in enumerate(NEIGHBOURS):
-            away = (number * sides.across[overlapping] / behind.shape[1]).astype(np.float32)
-            step, rise = blurred_step(distance - away, sharpness, amounts[:, None, ..., index])
-            value[..., overlapping, :] += step
-            slope[..., overlapping, :] += rise
-    return value, slope, own
-
-
-def _of_cells(t: Float32Array, sharpness: Float32Array) -> Float32Array:
-    """Shares (..., m, m) of the m cells along a side in columns at ``t`` (..., m), blurred along the side."""
-    z = (t[..., None] - np.linspace(0.0, 1.0, t.shape[-1] + 1)) * sharpness[..., None]
-    return np.asarray(-np.diff(0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR))), dtype=np.float32)
+def free_distance(sides: Sides, width: FloatArray) -> FloatArray:
+    """Distance (E, m) from the sides up to which no other edge shows, for blur of ``width`` (E, m) [px]."""
+    return np.asarray(sides.across / sides.across.shape[1] - _EDGE_SHOWS * width)
 
 
 def blurred_step(

@@ -25,6 +25,7 @@ from thermal_fiducial.core.detection.corners.sides import (
     blurred_step,
     columns_across,
     EdgeModel,
+    free_distance,
     NODES,
     Sides,
 )
@@ -45,7 +46,7 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 
 # Columns of pixels across an edge.
 _COLUMNS = 6
-# Distance from its ends and from other edges, in blurs, at which an edge is a straight step.
+# Distance from its ends, in blurs, at which an edge is a straight step.
 _QUIET = 2.0
 
 
@@ -139,7 +140,7 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer, thick
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, _COLUMNS, widest)
     blur = blur_of(sides, layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
-    measured = measure(counts_of(sides.pixel, layer.image, layer.to_tails), modelled, REACHED * blur.width, len(nodes))
+    measured = measure(counts_of(sides.pixel, layer.image, layer.to_tails), modelled, REACHED * blur.across, len(nodes))
     used = measured.variance[0] < UNMEASURED
     if used.sum() < 6:
         return None
@@ -171,11 +172,11 @@ def _outlines(T: FloatArray, size: float, pattern: GridEdges, thickness: float) 
 
 def _model(sides: Sides, step: FloatArray, blur: Blur) -> EdgeModel:
     """Model of edges that are straight steps, (M, C, E, 1), but near their ends and other edges."""
-    sharpness, height = (1.0 / blur.width).astype(np.float32), step[:, None].astype(np.float32)
+    sharpness, height = (1.0 / blur.across).astype(np.float32), step[:, None].astype(np.float32)
     value, slope = blurred_step(sides.distance, sharpness, height)
-    ends = _QUIET * blur.along[0] / sides.along
+    ends = _QUIET * blur.along / sides.along
     straight = sides.fresh & (sides.t > ends) & (sides.t < 1.0 - ends)
-    counting: BoolArray = np.asarray((np.abs(sides.distance) <= sides.across - _QUIET * blur.width) & straight)
+    counting: BoolArray = np.asarray((np.abs(sides.distance) <= free_distance(sides, blur.across)) & straight)
     if sides.inside is not None:
         counting &= sides.inside
     return EdgeModel(value, slope, counting)

@@ -47,25 +47,10 @@ _HARDLY_PX = 0.6
 _GAIN = 1.0 / (1.0 - _FORGOTTEN)
 
 
-def _moments(youngest: float, oldest: float) -> tuple[float, float]:
-    """Mean age and its standard deviation of the response between two ages, all in time constants."""
-    span = oldest - youngest
-    left = math.exp(-span)
-    return youngest + 1.0 - span * left / (1.0 - left), math.sqrt(1.0 - span**2 * left / (1.0 - left) ** 2)
-
-
-def _halves() -> FloatArray:
-    """The response younger than the lag tail as two Gaussians (2, 2), of its younger and of its older half."""
-    median = -math.log(0.5 * (1.0 + _FORGOTTEN))
-    halves = _moments(0.0, median), _moments(median, _TAIL)
-    return (np.array(halves) - [REMAINING, 0.0]) / SPREAD
-
-
 #: Motion blur that remains, as shares of that by the whole lag: its mean displacement, and its standard deviation.
-REMAINING, SPREAD = _moments(0.0, _TAIL)
-#: That motion blur as Gaussians of equal weight. It has sharp ends, and one Gaussian would have none: where it is as
-#: long as cells are wide, sides would be off by a tenth of it.
-WITHOUT_TAIL = _halves()
+#: Of an exponential response, those of the ages below m.
+REMAINING = 1.0 - _TAIL * _FORGOTTEN / (1.0 - _FORGOTTEN)
+SPREAD = math.sqrt(1.0 - _TAIL**2 * _FORGOTTEN / (1.0 - _FORGOTTEN) ** 2)
 #: Age, in time constants, of the velocity that gives the displacement of the lag tail.
 LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
 
