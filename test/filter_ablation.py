@@ -117,7 +117,7 @@ MECHANISMS = {
         ('update:_in_clock_of_imu',),
         {'update:_in_clock_of_imu': lambda _, covariance, *__: covariance},
     ),
-    'errors in variables': Mechanism(('slow and noisy',), off={'update:_FEIGNED': 0.0}),
+    'errors in variables': Mechanism(('slow and noisy',), off={'update:_SPURIOUS': 0.0}),
     'motion at a pose from 0.1 s': Mechanism(('slow and noisy',), off={'imu_buffer:_MOTION_SECONDS': 0.0}),
     'steps of the clock of the camera': Mechanism(
         ('stepping clock',), ('camera_clock:CameraClock',), {'camera_clock:CameraClock.proposed': _first(0)}

@@ -107,7 +107,7 @@ class PoseEkf:
         seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS
         densities = self._noise.densities(imu, seconds) if len(buffer) else np.zeros(6)
         if self._config.estimate_time_offset and 0 < self._input.excess_ns < SMALLEST_STEP_NS:
-            self._history.suspect_clock_step(self._input.excess_ns)
+            self._history.suspect_imu_step(self._input.excess_ns)
         buffer.append(sample.stamp_ns, imu, densities)
         return True
 
@@ -142,7 +142,7 @@ class PoseEkf:
         if not step_ns:
             return pose
         if abs(step_ns) < SMALLEST_STEP_NS:
-            self._count_with_step(abs(step_ns))
+            self._allow_for_step(abs(step_ns))
             return pose
         restamped = replace(pose, stamp_ns=pose.stamp_ns - step_ns)
         if self._camera_clock.is_of_imu(step_ns):
@@ -156,7 +156,7 @@ class PoseEkf:
         self._history.take_in()
         return restamped
 
-    def _count_with_step(self, size_ns: int) -> None:
+    def _allow_for_step(self, size_ns: int) -> None:
         """Leave a step of the camera's clock to the offset: since its first pose that may be off by ``size_ns``.
 
         Poses may be late or early by as much without a step, and may not contradict the estimate if there is one.
@@ -180,7 +180,7 @@ class PoseEkf:
         return main.accepted_in_row == 0 and (innovation is None or innovation.nis > self._config.gate)
 
     def _fits(self, pose: CameraPose) -> bool:
-        """Whether a pose can be used, and passes the gate if the clock offset is taken for unknown."""
+        """Whether a pose can be used, and passes the gate if the clock offset is treated as unknown."""
         innovation = self._history.compared(pose)
         return innovation is not None and is_of_unknown_clock(self._config, innovation) and not self._unusable(pose)
 

@@ -78,8 +78,8 @@ class History:
         steps = self.imu.steps(estimate.stamp_ns, until_ns)
         return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self.walks))
 
-    def suspect_clock_step(self, size_ns: int) -> None:
-        """Count with a step of the IMU's clock by ``size_ns`` after the newest sample; or samples are lost there."""
+    def suspect_imu_step(self, size_ns: int) -> None:
+        """Allow for a step of the IMU's clock by ``size_ns`` after the newest sample: or samples are lost there."""
         self._imu_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
 
     def _alternative(self) -> Hypothesis | None:
@@ -120,7 +120,7 @@ class History:
         self._go_back_before(pose.stamp_ns)
 
     def suspect_camera_step(self, stamp_ns: int, size_ns: int) -> None:
-        """Count with a step of the camera's clock by ``size_ns`` before the first kept pose from ``stamp_ns`` on."""
+        """Allow for a step of the camera's clock by ``size_ns`` before the first kept pose from ``stamp_ns`` on."""
         since = bisect_left(self._poses, stamp_ns, key=_stamp)
         if since < len(self._poses):
             first_ns = self._poses[since].stamp_ns

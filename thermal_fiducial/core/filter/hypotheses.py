@@ -63,7 +63,7 @@ def contradiction(config: PoseEkfConfig, hypothesis: Hypothesis, innovation: Inn
 
 
 def is_of_unknown_clock(config: PoseEkfConfig, innovation: Innovation) -> bool:
-    """Whether a pose passes the gate once the clock offset is taken for unknown."""
+    """Whether a pose passes the gate once the clock offset is treated as unknown."""
     covariance = with_unknown_clock(config, innovation.estimate.covariance)
     return with_covariance(config, innovation, covariance).nis <= config.gate
 

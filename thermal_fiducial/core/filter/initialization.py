@@ -80,12 +80,12 @@ def start(
     P = np.diag(_initial_variances(config))
     P[SYSTEMATIC, SYSTEMATIC] = config.systematic_pose_std**2 * pose.shape
     P[np.ix_(POSE, POSE)] += noise.variances[0] * pose.shape
-    # What the pose is wrong by lastingly is an error of the estimate, with the opposite sign.
+    # A systematic error of the pose is an error of the estimate, with the opposite sign.
     for place in (SYSTEMATIC, EXTRINSICS):
-        lasting = P[place, place]
-        P[np.ix_(POSE, POSE)] += lasting
-        P[POSE, place] -= lasting
-        P[place, POSE] -= lasting
+        systematic = P[place, place]
+        P[np.ix_(POSE, POSE)] += systematic
+        P[POSE, place] -= systematic
+        P[place, POSE] -= systematic
     state = replace(
         prior,
         R_map_body=pose.T_map_body[:3, :3],

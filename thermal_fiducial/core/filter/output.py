@@ -93,8 +93,8 @@ def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:
 class SmoothOutput:
     """A pose without steps, for controllers that need one: it lags behind, and its covariance is not consistent.
 
-    It integrates the filter's twist, and approaches the filter's pose with a time constant. It starts anew where stamps
-    go back.
+    It integrates the filter's twist, and approaches the filter's pose with a time constant. Where stamps go back it
+    starts again.
     """
 
     def __init__(self, seconds: float) -> None:

@@ -34,7 +34,7 @@ from thermal_fiducial.core.types import FloatArray
 #: The derivative of a pose by the clock offset is a measured motion. Its noise n adds spurious information about the
 #: offset, 1 to 2 times n' diag(S^-1) n, growing with the gain. It is taken away; the offset's variance at most doubles
 #: in one step.
-_FEIGNED, _LEAST_KEPT = 1.5, 0.5
+_SPURIOUS, _LEAST_KEPT = 1.5, 0.5
 _SIX = np.arange(6)
 #: Copied for every update, as an update leaves its results in the object.
 _ALGEBRA = ExtendedKalmanFilter(dim_x=SIZE, dim_z=6)
@@ -199,8 +199,9 @@ def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, inno
 
     A pose measures the state at the camera's stamp, X(t) Exp(derivative s). The error of that state does not depend on
     the linearisation point of the derivative, so the error of X(t) is shifted with it; otherwise each correction of the
-    velocity would feign information about the offset s. (G. Huang, A. Mourikis, S. Roumeliotis, "Observability-based
-    Rules for Designing Consistent EKF SLAM Estimators", IJRR 2010, keep other unobservable directions in the same way.)
+    velocity would add spurious information about the offset s. (G. Huang, A. Mourikis, S. Roumeliotis,
+    "Observability-based Rules for Designing Consistent EKF SLAM Estimators", IJRR 2010, keep other unobservable
+    directions in the same way.)
 
     Noise of the derivative adds spurious information, too (errors in variables), which is taken away again.
     """
@@ -209,9 +210,9 @@ def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, inno
     followed = of_core(innovation.derivative - now)
     half = np.outer(followed, with_offset + 0.5 * variance * followed)
     noise = np.repeat((motion.rate_variance, motion.velocity_variance), 3)
-    feigned = _FEIGNED * float(innovation.S_inverse.diagonal() @ noise)
+    spurious = _SPURIOUS * float(innovation.S_inverse.diagonal() @ noise)
     widest = max(variance, config.time_offset_std**2)
-    consistent = min(variance / max(1.0 - variance * feigned, _LEAST_KEPT), widest)
+    consistent = min(variance / max(1.0 - variance * spurious, _LEAST_KEPT), widest)
     by_offset = of_clock(now)
     return P + half + half.T + (consistent - variance) * np.outer(by_offset, by_offset)
 

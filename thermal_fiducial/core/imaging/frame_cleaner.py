@@ -27,8 +27,8 @@ REPEATED_STAMP = 'stamp seen before'
 # Least shift of counts by drivers that fill 16 bits.
 _SHIFTED = 2
 # Share (a power of two) of the range of counts by which neighbours differ at most, and the fewest pairs that show a
-# carry: flags look alike only between a pixel near nought and one near full scale. Frames in a row that show carries
-# which all later ones are taken for such because of: one alone may be garbled.
+# carry: flags look alike only between a pixel near nought and one near full scale. After so many frames in a row with
+# carries, later frames need not show any: a single frame may be garbled.
 _NEARLY, _FEWEST_CARRIES, _FRAMES_WITH_CARRIES = 3, 8, 3
 # Rows of an image; a frame with up to MAX_TELEMETRY_ROWS more carries telemetry.
 STANDARD_HEIGHTS = (1024, 512, 480, 256, 240, 128, 120)

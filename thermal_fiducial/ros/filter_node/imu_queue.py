@@ -61,7 +61,7 @@ class ImuQueue:
             self._node.guard(self._on_message, message)
 
     def begin_period(self) -> None:
-        """Report the longest delay so far from here on, and measure anew."""
+        """Report the longest delay of the period that ends, and begin another one."""
         self.measure()
         self._reported, self._longest = self._longest, 0.0
 
