@@ -131,10 +131,10 @@ class FrameCleaner:
         """Counts without the shift of the driver and without flag bits, in place."""
         sample, bits = counts[:: FreezeDetector.ROW_STEP], self.config.bits
         # Some drivers shift counts up; without a shift, noise sets the lowest bits of some pixels. A shift shows where
-        # counts need more bits than they have, and stays.
+        # counts need more bits than they have, and stays; a frame of nothing but zeros has no lowest bit.
         used = int(np.bitwise_or.reduce(sample, axis=None))
         shift = (used & -used).bit_length() - 1
-        if shift < _SHIFTED:
+        if 0 <= shift < _SHIFTED:
             self._shift = 0
         elif used >> bits and not self._shift:
             self._shift = shift

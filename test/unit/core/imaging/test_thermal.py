@@ -119,6 +119,16 @@ def test_a_shift_stays_while_nothing_is_hot():
         assert np.array_equal(camera(counts << np.uint16(2)).counts, counts)
 
 
+def test_an_empty_frame_says_nothing_of_the_shift():
+    """A driver sends zeros now and then; the scene has cooled below 4096 counts since."""
+    camera, rng = Camera(), np.random.default_rng(6)
+    hot = noisy(scene(), rng)
+    camera(hot << np.uint16(2))
+    camera(np.zeros_like(hot))
+    cold = hot - np.uint16(3500)
+    assert np.array_equal(camera(cold << np.uint16(2)).counts, cold)
+
+
 @pytest.mark.parametrize('rows', [1, 2])
 @pytest.mark.parametrize('top', [False, True])
 def test_telemetry_rows_are_cut_from_either_side(rows, top):
