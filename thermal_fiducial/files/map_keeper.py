@@ -82,7 +82,7 @@ class MapKeeper:
         return marker_map
 
     def take(self) -> None:
-        """The map that was read last replaces the one before, what that has not saved included."""
+        """The map that was read last replaces the one before, which :meth:`put_aside` has kept if it was not saved."""
         self._read, self.unsaved = self._at_hand, False
         if self._own_autosave:
             self._retire_autosave()
@@ -131,21 +131,36 @@ class MapKeeper:
             self._read = map_history.save_with_history(self.path, marker_map, 'save', self._read)
         except InputError as error:
             self.obstacle = str(error)
-            return self._save_elsewhere(marker_map)
+            return self._save_elsewhere(marker_map, 'new')
         self.fault = ''
         self._retire_autosave()
         return self.path
 
-    def _save_elsewhere(self, marker_map: MarkerMap) -> Path:
-        name = f'{self.path.stem}.new{self.path.suffix}'
+    def put_aside(self, marker_map: MarkerMap) -> Path | None:
+        """Write a map that is about to be replaced beside its file; returns the written file, None if it was saved.
+
+        Raises
+        ------
+        InputError
+            Nothing can be written anywhere.
+        """
+        self.obstacle = ''
+        return self._save_elsewhere(marker_map, 'replaced') if self.unsaved and marker_map.markers else None
+
+    def _save_elsewhere(self, marker_map: MarkerMap, kind: str) -> Path:
+        name = f'{self.path.stem}.{kind}{self.path.suffix}'
         others: tuple[Callable[[], Path], ...] = (_own_folder, _new_folder) if self._flown else ()
+        reason = self.obstacle
         for folder in (lambda: self.path.parent, *others):
-            with suppress(OSError, InputError):
+            try:
                 path = folder() / name
                 map_history.save_with_history(path, marker_map, 'save')
+            except (OSError, InputError) as error:
+                reason = reason or str(error)
+            else:
                 return path
         self.unsaved = True
-        raise InputError(f'the map is not saved: {self.obstacle}')
+        raise InputError(f'the map is not saved: {reason}')
 
     def undo(self) -> str:
         """Restore the previous version of the file; returns the undone action.

@@ -94,6 +94,30 @@ def test_a_map_that_a_load_has_discarded_does_not_come_back(path):
     assert restarted.recover(AUTOSAVE_S) == (None, '')
 
 
+def test_a_flown_map_that_is_replaced_unsaved_is_kept_beside_the_file(path):
+    keeper = keeper_of(path)
+    autosaved(keeper, grown(2))
+    for revision in (3, 4):
+        keeper.unsaved = True
+        aside = keeper.put_aside(grown(revision))
+        assert (aside, whole(aside)) == (path.with_name('hall.replaced.yaml'), revision)
+        keeper.take()
+        assert keeper.put_aside(grown(revision)) is None
+    assert whole(path) == 1
+    assert main(['map', 'undo', str(aside)]) == 0
+    assert whole(aside) == 3
+
+
+def test_a_map_that_cannot_be_put_aside_stays(path, monkeypatch):
+    keeper = MapKeeper(path, 0.3, {}, flown=False)
+    keeper.load()
+    keeper.unsaved = True
+    monkeypatch.setattr(map_history, 'write_atomically', lambda *_: (_ for _ in ()).throw(OSError(28, 'No space left')))
+    with pytest.raises(InputError, match=r'hall\.replaced\.yaml.*No space left'):
+        keeper.put_aside(grown(2))
+    assert keeper.unsaved
+
+
 def test_a_map_that_came_too_late_to_be_taken_replaces_nothing(path):
     """A disk was busy for longer than the service waits; meanwhile another program has changed the file."""
     keeper = keeper_of(path)

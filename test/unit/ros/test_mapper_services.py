@@ -71,6 +71,29 @@ def test_load_undo_and_save_of_a_free_map(graph, map_file, mode):
     assert ask(graph, 'reset') == (True, '2 markers left')
 
 
+class Flown(MarkerMapperNode):
+    """A mapper that can find a marker without a frame."""
+
+    def find(self, marker_id):
+        self.mapper.map.markers[marker_id] = replace(self.mapper.map.markers[0], id=marker_id)
+        self._map.note_learned()
+
+
+@pytest.mark.parametrize('name', ['load', 'undo'])
+def test_flown_markers_that_a_load_or_undo_replaces_can_be_had_back(graph, map_file, name):
+    node = graph.add(Flown, map_file=str(map_file), mode='mapping')
+    # What undo undoes.
+    assert ask(graph, 'reset')[0]
+    assert ask(graph, 'save')[0]
+    node.find(9)
+    success, message = ask(graph, name)
+    aside = map_file.with_name('map.replaced.yaml')
+    assert success
+    assert message.endswith(f'1 marker loaded from {map_file}; 2 markers before it, unsaved until now, are in {aside}')
+    assert node.mapper.map.markers.keys() == {0}
+    assert load_map(aside).markers.keys() == {0, 9}
+
+
 def test_a_map_file_that_was_mended_and_loaded_is_no_fault_any_more(graph, map_file):
     text = map_file.read_text()
     map_file.write_text('markers: [')

@@ -125,12 +125,14 @@ class MapServices:
     def load(self) -> str:
         """Reload the map file, for example after edits with ``thermal-fiducial map``."""
         self._refuse_frozen()
-        loaded = self._in_time(self._read)
+        before = self.mapper.map.copy()
+        loaded, aside = self._in_time(lambda: (self._read(), self._keeper.put_aside(before)))
         self._keeper.take()
         while self._unread:
             self._node.faults.remove(self._unread.pop())
         self._publish_jump(self.mapper.load(loaded))
-        return f'{loaded.size_in_words} loaded from {self._keeper.path}'
+        kept = f'; {before.size_in_words} before it, unsaved until now, are in {aside}' if aside else ''
+        return f'{loaded.size_in_words} loaded from {self._keeper.path}{kept}'
 
     def undo(self) -> str:
         """Restore the previous version of the map file and load it."""
