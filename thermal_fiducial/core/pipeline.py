@@ -160,9 +160,6 @@ class Pipeline:
             np.stack([rows[name] for name in ('qx', 'qy', 'qz', 'qw')], axis=-1),
         )
         self.detector.set_map(
-            {
-                int(row['id']): (pose, float(row['size']))
-                for row, pose in zip(rows, poses, strict=True)
-                if row['trusted']
-            }
+            {int(row['id']): (pose, float(row['size'])) for row, pose in zip(rows, poses, strict=True)},
+            rows['id'][rows['trusted'] == 0].tolist(),
         )

@@ -77,7 +77,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
 
     def _on_map(self, message: PointCloud2) -> None:
         if self.detector is not None:
-            self.detector.set_map(clouds.map_poses(message))
+            self.detector.set_map(*clouds.map_poses(message))
 
     def state(self) -> tuple[bytes, str]:
         """Number of markers in the last frame, markers of another dictionary, images skipped since the last call."""

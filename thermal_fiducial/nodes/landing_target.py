@@ -44,8 +44,9 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         return camera_in_body(self.config)
 
     def _on_map(self, message: PointCloud2) -> None:
-        poses = clouds.map_poses(message)
-        self._T_map_pad = pad_in_map({key: pose for key, (pose, _) in poses.items()}, self.config.landing_pad)
+        poses, quarantined = clouds.map_poses(message)
+        trusted = {key: pose for key, (pose, _) in poses.items() if key not in quarantined}
+        self._T_map_pad = pad_in_map(trusted, self.config.landing_pad)
 
     def _on_markers(self, message: bytes) -> None:
         stamp, markers = clouds.stamped_markers(message)

@@ -276,11 +276,11 @@ def test_corners_that_are_not_finite_are_refused(name):
         clouds.markers(clouds.cloud(rows, HEAD))
 
 
-def test_the_map_for_the_detector_has_the_trusted_markers():
+def test_the_map_for_the_detector_says_which_markers_are_in_quarantine():
     rows = np.zeros(2, MAP_DTYPE)
     rows['id'], rows['trusted'], rows['size'], rows['qw'], rows['x'] = [4, 5], [1, 0], 0.3, 1.0, [2.0, 3.0]
-    poses = clouds.map_poses(sent(clouds.cloud(rows, HEAD)))
-    assert list(poses) == [4]
+    poses, quarantined = clouds.map_poses(sent(clouds.cloud(rows, HEAD)))
+    assert (list(poses), quarantined) == ([4, 5], {5})
     T, size = poses[4]
     np.testing.assert_array_equal(T, transform(np.eye(3), [2.0, 0.0, 0.0]))
     assert size == np.float32(0.3)

@@ -1,6 +1,6 @@
 """Markers of a frame: predicted, found, refined, confirmed, both poses of each."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -57,9 +57,11 @@ class MarkerDetector:
     def _mount(self, config: ArucoDetectorConfig) -> None:
         self._history = FrameHistory(MotionTrack(se3.camera_in_body(config), config.bolometer_lag))
 
-    def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
-        """Set the known markers: ID to (T_map_marker, side [m])."""
-        self._known = KnownMarkers(marker_map, self._sizes)
+    def set_map(
+        self, marker_map: Mapping[int, tuple[FloatArray, float]], quarantined: Collection[int] = frozenset()
+    ) -> None:
+        """Set the known markers: ID to (T_map_marker, side [m]), and the IDs that are not expected at their places."""
+        self._known = KnownMarkers(marker_map, self._sizes, quarantined)
 
     def size(self, marker_id: int) -> float:
         """Side of a marker [m]: from the map, else from the overrides, else the common one."""

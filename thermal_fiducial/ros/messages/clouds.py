@@ -222,8 +222,8 @@ def marker_poses(rows: Markers, head: Header) -> PoseArray:
     return PoseArray(header=head, poses=[pose_of_row(row) for row in rows])
 
 
-def map_poses(message: PointCloud2) -> dict[int, tuple[FloatArray, float]]:
-    """ID to T_map_marker (4, 4) and side [m] of the trusted markers of a ``marker_map`` cloud.
+def map_poses(message: PointCloud2) -> tuple[dict[int, tuple[FloatArray, float]], frozenset[int]]:
+    """ID to T_map_marker (4, 4) and side [m] of the markers of a ``marker_map`` cloud; IDs that are in quarantine.
 
     Raises
     ------
@@ -231,7 +231,6 @@ def map_poses(message: PointCloud2) -> dict[int, tuple[FloatArray, float]]:
         A missing field, inconsistent sizes, or a marker with an invalid pose or side.
     """
     rows = cloud_rows(message, MAP_DTYPE)
-    rows = rows[rows['trusted'] != 0]
     positions, quaternions = columns(rows, ('x', 'y', 'z')), columns(rows, ('qx', 'qy', 'qz', 'qw'))
     possible = (np.abs(positions) < LARGEST_COORDINATE).all(axis=-1)
     possible &= np.abs(np.linalg.norm(quaternions, axis=-1) - 1.0) < NORM_TOLERANCE
@@ -239,4 +238,5 @@ def map_poses(message: PointCloud2) -> dict[int, tuple[FloatArray, float]]:
     if not possible.all():
         raise InputError(f'marker_map with marker {rows["id"][~possible][0]} of an impossible pose or size')
     T = transform_from_quaternion(positions, quaternions)
-    return {int(row['id']): (T_map_marker, float(row['size'])) for row, T_map_marker in zip(rows, T, strict=True)}
+    poses = {int(row['id']): (T_map_marker, float(row['size'])) for row, T_map_marker in zip(rows, T, strict=True)}
+    return poses, frozenset(rows['id'][rows['trusted'] == 0].tolist())

@@ -177,7 +177,9 @@ class MarkerFinder:
 
     def allowed(self, known: KnownMarkers, config: ArucoDetectorConfig) -> BoolArray:
         """Which IDs of the dictionary may be found."""
-        wanted = known.ids if len(known.ids) and config.whitelist_from_map else np.array(config.whitelist, dtype=int)
+        # With those in quarantine: only a marker that is found can be released.
+        by_map = config.whitelist_from_map and len(known.mapped) > 0
+        wanted = known.mapped if by_map else np.array(config.whitelist, dtype=int)
         if len(wanted) == 0:
             return np.ones(self._decoder.count, dtype=bool)
         return np.asarray(np.isin(np.arange(self._decoder.count), wanted))

@@ -1,6 +1,6 @@
 """Markers found in a frame, and the markers of a map as predicted in the image of a camera."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -111,15 +111,23 @@ class KnownMarkers:
     ----------
     markers : ID to (T_map_marker, side [m])
     sizes : (M,) sides of all markers of the dictionary by ID, which those of the map replace [m]
+    quarantined : IDs of the map that are not expected at their places
     """
 
-    def __init__(self, markers: Mapping[int, tuple[FloatArray, float]], sizes: FloatArray) -> None:
-        #: (K,) IDs of the markers in the map, ascending
-        self.ids = np.array(sorted(key for key in markers if 0 <= key < len(sizes)), dtype=np.int64)
-        #: (M,) sides [m] and (M, 4, 4) poses in the map, NaN if not in it, of all markers of the dictionary by ID
+    def __init__(
+        self,
+        markers: Mapping[int, tuple[FloatArray, float]],
+        sizes: FloatArray,
+        quarantined: Collection[int] = (),
+    ) -> None:
+        #: (L,) IDs of all markers in the map, ascending, and (K,) of those that are not in quarantine
+        self.mapped = np.array(sorted(key for key in markers if 0 <= key < len(sizes)), dtype=np.int64)
+        self.ids = self.mapped[~np.isin(self.mapped, list(quarantined))]
+        #: (M,) sides [m] and (M, 4, 4) poses in the map, NaN if not expected, of all markers of the dictionary by ID
         self.sizes, self.T_map_marker = sizes.copy(), np.full((len(sizes), 4, 4), np.nan)
-        for marker_id in self.ids.tolist():
+        for marker_id in self.mapped.tolist():
             self.T_map_marker[marker_id], self.sizes[marker_id] = markers[marker_id]
+        self.T_map_marker[np.setdiff1d(self.mapped, self.ids)] = np.nan
         T_map_marker = self.T_map_marker[self.ids]
         corners = corners_in_map(T_map_marker, self.sizes[self.ids])
         self._corners_and_normals = np.concatenate([corners, T_map_marker[:, None, :3, 2]], axis=1)
