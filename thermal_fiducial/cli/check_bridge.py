@@ -27,7 +27,7 @@ def add_arguments(parser: Parser) -> None:
         'Verify rate, stamps, frames (gravity of a still drone, a yaw turn), velocity and covariance of what a flight '
         'controller would receive, and the landing target where there is one, and say what it would do with it. '
         'Without RECORDING it listens: keep the drone still for some seconds, then turn it by hand to the left and '
-        'back. Exit status 1 if there is a fault.'
+        'back, and carry it about. Exit status 1 if there is a fault.'
     )
     parser.add_argument('recording', nargs='?', type=Path, metavar='RECORDING', help='bag or run folder; none: listen')
     parser.add_argument('--topic', default='', help='odometry to check (default: what pose_ekf sends, as remapped)')
@@ -79,7 +79,7 @@ def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> 'tuple[Brid
     def announce(topics: Topics) -> None:
         print(
             f'Listening to {topics.odometry} and {topics.imu} for {seconds:g} s: '
-            'keep still, then turn left and back by hand.',
+            'keep still, then turn left and back by hand, then carry it about.',
             file=sys.stderr,
         )
 

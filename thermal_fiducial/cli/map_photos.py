@@ -15,7 +15,7 @@ from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import read_picture
-from thermal_fiducial.files.reading import naming
+from thermal_fiducial.files.reading import naming, require_folder
 
 _IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
 #: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.
@@ -26,8 +26,7 @@ _APART_NS = 100_000_000_000
 
 def photos_in(folder: Path) -> list[Path]:
     """Pictures of a folder, sorted by name. Raises InputError if it has none."""
-    if not folder.is_dir():
-        raise InputError(f'{folder}: no such folder')
+    require_folder(folder)
     photos = sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGES)
     if not photos:
         raise InputError(f'{folder}: no photos ({", ".join(sorted(_IMAGES))})')

@@ -113,6 +113,7 @@ def _build(args: argparse.Namespace) -> int:
 
 
 def _refine(args: argparse.Namespace) -> int:
+    require_regular(args.map)
     work = _MapInProgress.of(args.out or args.map, f'refine from {args.run_folder.name}')
     file = args.run_folder
     if file.is_dir():

@@ -68,7 +68,7 @@ def nest(drawings: Sequence[Drawing], width: float, height: float, *, spacing: f
         sheets.append(_Sheet(width, height, spacing, margin))
         if not sheets[-1].put(drawing):
             raise InputError(
-                f'{drawing.name} of {drawing.width:g} x {drawing.height:g} mm does not fit on a sheet of '
+                f'marker {drawing.name} of {drawing.width:g} x {drawing.height:g} mm does not fit on a sheet of '
                 f'{width:g} x {height:g} mm with a margin of {margin:g} mm'
             )
     return [combined(f'sheet-{index}', width, height, sheet.placed) for index, sheet in enumerate(sheets, 1)]

@@ -60,6 +60,12 @@ def require_regular(path: str | Path) -> None:
         pass
 
 
+def require_folder(path: Path, kind: str = 'folder') -> None:
+    """Raise InputError unless ``path`` is a folder; ``kind`` says of what."""
+    if not path.is_dir():
+        raise InputError(f'{path}: is a file, not a {kind}' if is_there(path) else f'{path}: no such {kind}')
+
+
 @contextmanager
 def _opened(path: str | Path, limit: int) -> Iterator[BinaryIO]:
     try:

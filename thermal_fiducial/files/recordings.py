@@ -24,6 +24,7 @@ from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import csv_rows
 from thermal_fiducial.files.images import read_picture
+from thermal_fiducial.files.reading import require_folder
 from thermal_fiducial.files.records import is_imu_reading
 from thermal_fiducial.files.rig_files import body_sensor, densities, of_camchain, of_rig, of_sensor, Rig
 from thermal_fiducial.files.trajectory_file import load_tum
@@ -99,8 +100,7 @@ def read_recording(
     InputError
         None of the layouts, a missing file, or invalid content; the message names file and line.
     """
-    if not folder.is_dir():
-        raise InputError(f'{folder}: no such folder')
+    require_folder(folder)
     is_kalibr = (folder / 'imu0.csv').exists()
     if (camchain or imu) and not is_kalibr:
         raise InputError(f"{folder}: no imu0.csv: --camchain and --imu are for Kalibr's layout")

@@ -15,7 +15,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.plain_yaml import load_plain
-from thermal_fiducial.files.reading import is_there, one_line, read_text
+from thermal_fiducial.files.reading import is_there, one_line, read_text, require_folder
 from thermal_fiducial.files.writing import unfinished
 from thermal_fiducial.report.output_bag import read_output, RecordedOutput
 from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
@@ -77,8 +77,7 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
     InputError
         No run folder, or a broken file in it.
     """
-    if not path.is_dir():
-        raise InputError(f'{path}: no such run folder')
+    require_folder(path, 'run folder')
     missing = [name for name in (FUSED, FIDUCIAL) if not (path / name).exists()]
     if any(unfinished(path / name).exists() for name in missing):
         raise InputError(f'{path}: its replay was cut short; replay it again')

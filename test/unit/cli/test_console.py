@@ -94,10 +94,17 @@ def test_a_table_that_fits_the_window_stays_within_it(monkeypatch):
         (['replay', 'nope.mcap', '--out', 'run', '--no-report'], 'nope.mcap: no such bag'),
         (['replay', 'nope.mcap', '--out', 'run', '--rate', '2'], '--rate has no effect without --transport processes'),
         (['calibrate', 'intrinsics', 'nope'], 'nope: no such folder of pictures, bag or CSV file'),
+        (['evaluate', 'nope'], 'nope: no such run folder'),
+        (['evaluate', 'a.txt'], 'a.txt: is a file, not a run folder'),
+        (['import', 'a.txt', '--out', 'bag'], 'a.txt: is a file, not a folder'),
+        (['map', 'refine', 'run', 'map.yaml'], 'run: is a folder, not a file'),
     ],
 )
-def test_missing_inputs_are_named(command, said, tmp_path, capsys, monkeypatch):
+def test_inputs_that_are_missing_or_of_another_kind_are_named(command, said, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / 'a.txt').touch()
+    (tmp_path / 'run').mkdir()
+    (tmp_path / 'map.yaml').touch()
     assert main(command) == 2
     assert said in capsys.readouterr().err
 
