@@ -14,7 +14,7 @@ from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import OK, StageNode, WARN
-from thermal_fiducial.ros.frames.landing_pad import for_mavros, pad_in_map
+from thermal_fiducial.ros.frames.landing_pad import for_mavros, pad_in_map, what_lacks
 from thermal_fiducial.ros.frames.robot_frames import RobotFrames
 from thermal_fiducial.ros.messages import clouds, convert, message_bytes
 from thermal_fiducial.ros.process.run import run
@@ -30,6 +30,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         if not self.config.landing_pad:
             self.fault('parameter landing_pad: name the markers of the pad')
         self._T_map_pad: FloatArray | None = None
+        self._lacking = 'the pad is not in the map'
         #: stamps of frames that show the pad and wait for their camera pose
         self._frames: OrderedDict[int, None] = OrderedDict()
         self._in_view = False
@@ -44,9 +45,9 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         return camera_in_body(self.config)
 
     def _on_map(self, message: PointCloud2) -> None:
-        poses, quarantined = clouds.map_poses(message)
+        pad, (poses, quarantined) = self.config.landing_pad, clouds.map_poses(message)
         trusted = {key: pose for key, (pose, _) in poses.items() if key not in quarantined}
-        self._T_map_pad = pad_in_map(trusted, self.config.landing_pad)
+        self._T_map_pad, self._lacking = pad_in_map(trusted, pad), what_lacks(pad, poses, quarantined)
 
     def _on_markers(self, message: bytes) -> None:
         stamp, markers = clouds.stamped_markers(message)
@@ -86,7 +87,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
     def state(self) -> tuple[bytes, str]:
         """Whether the pad is known and in view."""
         if self._T_map_pad is None and not self._needs_no_map:
-            return WARN, 'the pad is not in the map'
+            return WARN, self._lacking
         return OK, 'ok' if self._in_view else 'the pad is not in view'
 
 

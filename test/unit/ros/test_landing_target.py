@@ -37,11 +37,11 @@ def graph(graph):
     return graph
 
 
-def marker_map(ids=(7, 8)):
+def marker_map(ids=(7, 8), quarantined=()):
     rows = np.zeros(len(ids), MAP_DTYPE)
     for row, marker_id in zip(rows, ids, strict=True):
         T = T_MAP_MARKERS[marker_id]
-        row['id'], row['size'], row['trusted'] = marker_id, 0.3, 1
+        row['id'], row['size'], row['trusted'] = marker_id, 0.3, marker_id not in quarantined
         row['x'], row['y'], row['z'] = T[:3, 3]
         row['qx'], row['qy'], row['qz'], row['qw'] = quaternion_from_rotation(T[:3, :3])
     return clouds.cloud(rows, convert.header(STAMP, 'map'))
@@ -107,6 +107,16 @@ def test_px4_gets_it_in_the_map_that_its_odometry_is_in(graph):
     np.testing.assert_allclose(convert.transform_of(message.pose)[:3, 3], PAD, atol=1e-6)
 
 
+def test_a_marker_of_the_pad_in_quarantine_is_named(graph):
+    node = graph.add(LandingTarget, landing_pad=[7, 8], **EXTRINSICS)
+    graph.send('markers', markers())
+    graph.send('marker_map', marker_map(quarantined=[8]), profile=qos.LATCHED)
+    assert graph.diagnose(node)[:2] == (WARN, 'the pad is not in the map: marker 8 in quarantine')
+    graph.send('marker_map', marker_map(), profile=qos.LATCHED)
+    graph.send('markers', markers())
+    assert graph.diagnose(node)[:2] == (OK, 'the pad is not in view')
+
+
 def test_it_is_silent_while_the_pad_is_not_in_view(graph):
     node = graph.add(LandingTarget, landing_pad=[7], **EXTRINSICS)
     graph.send('marker_map', marker_map(), profile=qos.LATCHED)
@@ -144,7 +154,7 @@ def test_a_pad_that_needs_the_map_is_reported_as_missing_without_one(graph, para
     graph.send('marker_map', marker_map([8]), profile=qos.LATCHED)
     graph.send('markers', markers(7, 8))
     graph.send('camera_pose', camera_pose())
-    assert graph.diagnose(node)[:2] == (WARN, 'the pad is not in the map')
+    assert graph.diagnose(node)[:2] == (WARN, 'the pad is not in the map: marker 7 missing')
     assert not graph.heard['landing_target']
 
 

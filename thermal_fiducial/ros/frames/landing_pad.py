@@ -1,6 +1,6 @@
 """Pose of a landing pad: one marker of the map, or a group of them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -26,6 +26,13 @@ def pad_in_map(T_map_markers: Mapping[int, FloatArray], pad_ids: Sequence[int]) 
     T_map_pad = poses[0].copy()
     T_map_pad[:3, 3] = np.mean([T[:3, 3] for T in poses], axis=0)
     return T_map_pad
+
+
+def what_lacks(pad_ids: Sequence[int], mapped: Collection[int], quarantined: Collection[int]) -> str:
+    """Which markers of the pad the map lacks, those in its quarantine included."""
+    why = {key: 'in quarantine' if key in mapped else 'missing' for key in pad_ids}
+    lacking = [f'marker {key} {why[key]}' for key in pad_ids if key not in mapped or key in quarantined]
+    return f'the pad is not in the map: {", ".join(lacking)}'
 
 
 def for_mavros(T_body_pad: FloatArray) -> FloatArray:
