@@ -26,7 +26,7 @@ from thermal_fiducial.core.filter.update import body_pose, Innovation, innovatio
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import SECOND_NS
 
-#: The propagated estimate is stored at this interval [ns], so that a pose begins there and not at the pose before.
+#: A propagated belief is kept at this interval [ns], so that a pose begins there and not at the pose before.
 _KEPT_EVERY_NS = 10_000_000
 #: Standard deviation of a suspected step of the IMU's clock as a share of its size: the clock has stepped by all of it,
 #: or samples are lost and it has not stepped, with equal odds.
@@ -51,17 +51,18 @@ class History:
         self._offset_ns = round(camera_time_offset * SECOND_NS)
         self.imu, self.log = ImuBuffer(), PoseLog()
         self._poses: list[CameraPose] = []
+        #: after each pose, and behind it the same one propagated, with the same verdict; the first is before all poses
         self._beliefs = [Belief()]
         #: suspected steps of the camera's clock [ns], by the stamp of the first pose behind them
         self._camera_steps: dict[int, int] = {}
         #: suspected steps of the IMU's clock: stamp of the sample before [ns], standard deviation [s]
         self._imu_steps: list[tuple[int, float]] = []
-        #: the estimate at the newest sample
+        #: main hypothesis of the latest belief, propagated to the newest sample
         self.main: Hypothesis | None = None
 
     @property
     def belief(self) -> Belief:
-        """Belief after the latest pose."""
+        """The latest belief."""
         return self._beliefs[-1]
 
     def _carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
@@ -117,7 +118,7 @@ class History:
         if camera_step_ns:
             self._camera_steps[pose.stamp_ns] = camera_step_ns
         insort(self._poses, pose, key=_stamp)
-        self._go_back_before(pose.stamp_ns)
+        self._undo_from(pose.stamp_ns)
 
     def suspect_camera_step(self, stamp_ns: int, size_ns: int) -> None:
         """Allow for a step of the camera's clock by ``size_ns`` before the first kept pose from ``stamp_ns`` on."""
@@ -125,26 +126,23 @@ class History:
         if since < len(self._poses):
             first_ns = self._poses[since].stamp_ns
             self._camera_steps[first_ns] = size_ns
-            self._go_back_before(first_ns)
+            self._undo_from(first_ns)
 
     def discard(self, stamps_ns: Iterable[int]) -> None:
         """Remove poses by their stamps."""
         stamps = {pose.stamp_ns for pose in self._poses} & set(stamps_ns)
         self._poses = [pose for pose in self._poses if pose.stamp_ns not in stamps]
         if stamps:
-            self._go_back_before(min(stamps))
+            self._undo_from(min(stamps))
 
-    def _go_back_before(self, stamp_ns: int) -> None:
+    def _undo_from(self, stamp_ns: int) -> None:
         """Remove the beliefs after poses of ``stamp_ns`` and later."""
         while len(self._beliefs) > 1 and self.belief.verdict.stamp_ns >= stamp_ns:
-            self._forget_belief()
+            del self._beliefs[-1]
+            self.main = self.belief.main
         if not self.belief.hypotheses:
             # Another pose begins the initialisation.
             self._beliefs[-1] = self.belief._replace(first_offset=0.0)
-
-    def _forget_belief(self) -> None:
-        del self._beliefs[-1]
-        self.main = None
 
     def untimely(self, pose: CameraPose) -> str:
         """Why a pose with this stamp cannot be inserted; empty if it can."""
@@ -158,14 +156,10 @@ class History:
             return 'refused: too late'
         return 'refused: stamp repeated' if any(pose.stamp_ns == known.stamp_ns for known in self._poses) else ''
 
-    def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None) -> int:
-        """Instant of a pose in the IMU's clock, with the clock offset that ``hypothesis`` has estimated."""
-        offset = hypothesis.estimate.state.time_offset if hypothesis else 0.0
+    def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None, first_offset: float = 0.0) -> int:
+        """Instant of a pose in the IMU's clock, by the clock offset of ``hypothesis``; without one ``first_offset``."""
+        offset = hypothesis.estimate.state.time_offset if hypothesis else first_offset
         return pose.stamp_ns + self._offset_ns + round(offset * SECOND_NS)
-
-    def _begin_ns(self, belief: Belief, pose: CameraPose) -> int:
-        """Instant of a pose that begins an initialisation."""
-        return self.due_ns(pose, None) + round(belief.first_offset * SECOND_NS)
 
     def compared(self, pose: CameraPose) -> Innovation | None:
         """Innovation of a pose that is not inserted, against the estimate at its instant; None without one."""
@@ -184,19 +178,42 @@ class History:
     def take_in(self) -> None:
         """Apply all poses up to the newest sample, log the verdicts on them, and propagate to that sample."""
         while (pose := self._next_due()) is not None:
+            self._undo_propagation_beyond(pose)
             belief = self._after(pose)
-            if self._relinearised(belief):
+            if self._relinearise(belief):
                 continue
             self._beliefs.append(belief)
-            self.main = None
+            self.main = belief.main
             self.log.add(belief.verdict)
-        self._go_on()
+        newest_ns, belief = self.imu.newest_ns, self.belief
+        if self.main and belief.main:
+            self.main = self._carried(self.main, newest_ns)
+            if newest_ns - belief.main.estimate.stamp_ns >= _KEPT_EVERY_NS:
+                self._beliefs.append(belief._replace(main=self.main, alternative=self._alternative()))
         # Half of the buffer at a time: each removal moves the rest.
-        if self.imu.newest_ns - self.imu.oldest_ns > 2 * self._kept_ns:
+        if newest_ns - self.imu.oldest_ns > 2 * self._kept_ns:
             self._forget_old()
 
-    def _relinearised(self, belief: Belief) -> bool:
-        """Whether an initialisation that ends with ``belief`` begins once more, linearised about its clock offset.
+    def _next_due(self) -> CameraPose | None:
+        """The next pose to apply, if the samples reach its instant."""
+        belief = self.belief
+        place = bisect_right(self._poses, belief.verdict.stamp_ns, key=_stamp)
+        if place == len(self._poses):
+            return None
+        pose = self._poses[place]
+        begin_ns = self.due_ns(pose, None, belief.first_offset)
+        due_ns = max((self.due_ns(pose, h) for h in belief.hypotheses), default=begin_ns)
+        return pose if due_ns <= self.imu.newest_ns else None
+
+    def _undo_propagation_beyond(self, pose: CameraPose) -> None:
+        """Remove beliefs that were only propagated, without a pose, beyond the instant of ``pose``."""
+        while len(self._beliefs) > 1 and self._beliefs[-2].verdict is self.belief.verdict:
+            if all(h.estimate.stamp_ns <= self.due_ns(pose, h) for h in self.belief.hypotheses):
+                return
+            del self._beliefs[-1]
+
+    def _relinearise(self, belief: Belief) -> bool:
+        """Return to before an initialisation that ends with ``belief`` if it must begin once more; whether it must.
 
         A pose measures the state at the camera's stamp, to first order in the clock offset. In a brisk start with an
         offset of two standard deviations the second order is larger than the errors of the poses.
@@ -208,56 +225,31 @@ class History:
         if forgotten or not relinearises(belief.main, before.first_offset):
             return False
         while self.belief.hypotheses:
-            self._forget_belief()
+            del self._beliefs[-1]
         offset = belief.main.estimate.state.time_offset
         self._beliefs[-1] = self.belief._replace(first_offset=offset)
         return True
 
-    def _next_due(self) -> CameraPose | None:
-        belief = self.belief
-        place = bisect_right(self._poses, belief.verdict.stamp_ns, key=_stamp)
-        if place == len(self._poses):
-            return None
-        pose = self._poses[place]
-        due_ns = max((self.due_ns(pose, h) for h in belief.hypotheses), default=self._begin_ns(belief, pose))
-        return pose if due_ns <= self.imu.newest_ns else None
-
-    def _go_on(self) -> None:
-        """Propagate the estimate to the newest sample; it becomes a belief every ``_KEPT_EVERY_NS``."""
-        belief = self.belief
-        if belief.main is None:
-            return
-        self.main = self._carried(self.main or belief.main, self.imu.newest_ns)
-        if self.main.estimate.stamp_ns - belief.main.estimate.stamp_ns >= _KEPT_EVERY_NS:
-            self._beliefs.append(belief._replace(main=self.main, alternative=self._alternative()))
-
     def _after(self, pose: CameraPose) -> Belief:
         """The belief after the next pose."""
-        self._go_back_to(pose)
-        config, belief = self.config, self.belief
-        belief = belief._replace(verdict=PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan))
+        config, verdict = self.config, PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)
+        belief = self.belief._replace(verdict=verdict)
+        main, other = belief.main, belief.alternative
         if not belief.hypotheses:
             return self._begun(belief, pose)
-        against_main = self._innovation(belief.main, pose) if belief.main else None
-        if belief.main and against_main:
-            main, verdict = weigh(config, belief.main, against_main, pose.stamp_ns)
+        if main:
+            innovation = self._innovation(main, pose)
+            main, verdict = weigh(config, main, innovation, pose.stamp_ns)
             belief = belief._replace(main=main, verdict=verdict)
-        if belief.alternative:
-            innovation = self._innovation(belief.alternative, pose)
-            alternative, verdict = weigh(config, belief.alternative, innovation, pose.stamp_ns)
-            if belief.main is None and not verdict.accepted:
-                belief = belief._replace(contradiction=contradiction(config, belief.alternative, innovation))
+            if other is None and not verdict.accepted:
+                belief = self._with_alternative(belief, main, innovation)
+        if other:
+            innovation = self._innovation(other, pose)
+            alternative, verdict = weigh(config, other, innovation, pose.stamp_ns)
             belief = belief._replace(alternative=alternative)
-        elif against_main and not belief.verdict.accepted:
-            belief = self._with_alternative(belief, against_main)
+            if main is None and not verdict.accepted:
+                belief = belief._replace(contradiction=contradiction(config, other, innovation))
         return belief.settled(config)
-
-    def _go_back_to(self, pose: CameraPose) -> None:
-        """Remove beliefs that were only propagated, without a pose, beyond the instant of ``pose``."""
-        while len(self._beliefs) > 1 and self._beliefs[-2].verdict.stamp_ns == self.belief.verdict.stamp_ns:
-            if all(h.estimate.stamp_ns <= self.due_ns(pose, h) for h in self.belief.hypotheses):
-                return
-            self._forget_belief()
 
     def _innovation(self, hypothesis: Hypothesis, pose: CameraPose) -> Innovation:
         """Innovation of a pose against a hypothesis at its instant, never earlier than where the hypothesis is now."""
@@ -271,7 +263,7 @@ class History:
 
     def _begun(self, belief: Belief, pose: CameraPose) -> Belief:
         """``belief``, which is empty, with an alternative hypothesis begun from a pose."""
-        time_ns = max(self._begin_ns(belief, pose), self.imu.oldest_ns)
+        time_ns = max(self.due_ns(pose, None, belief.first_offset), self.imu.oldest_ns)
         window = self.imu.window(time_ns, WINDOW_SECONDS)
         begun = first_hypothesis(self.config, pose, time_ns, window, belief.first_offset)
         if begun is None:
@@ -279,10 +271,8 @@ class History:
             return belief._replace(contradiction=no_gravity(window), verdict=refused)
         return belief._replace(alternative=begun).settled(self.config)
 
-    def _with_alternative(self, belief: Belief, refused: Innovation) -> Belief:
-        """``belief`` with an alternative hypothesis begun from a pose that the estimate has just refused."""
-        main = belief.main
-        assert main is not None
+    def _with_alternative(self, belief: Belief, main: Hypothesis, refused: Innovation) -> Belief:
+        """``belief`` with an alternative hypothesis begun from a pose that its ``main`` one has just refused."""
         window = self.imu.window(refused.estimate.stamp_ns, WINDOW_SECONDS)
         begun = alternative_to(self.config, main, refused, window)
         if begun is None:
