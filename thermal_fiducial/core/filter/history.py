@@ -65,29 +65,6 @@ class History:
         """The latest belief."""
         return self._beliefs[-1]
 
-    def _carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
-        """A hypothesis propagated along the samples to an instant that is not later than the newest sample."""
-        estimate = hypothesis.estimate
-        if estimate.stamp_ns >= until_ns:
-            return hypothesis
-        for begin_ns, std in self._imu_steps:
-            if not estimate.stamp_ns <= begin_ns < until_ns:
-                continue
-            if begin_ns > estimate.stamp_ns:
-                estimate = propagated(estimate, self.imu.steps(estimate.stamp_ns, begin_ns), begin_ns, self.walks)
-            estimate = estimate.after_imu_step(self.imu.at(begin_ns), std)
-        steps = self.imu.steps(estimate.stamp_ns, until_ns)
-        return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self.walks))
-
-    def suspect_imu_step(self, size_ns: int) -> None:
-        """Allow for a step of the IMU's clock by ``size_ns`` after the newest sample: or samples are lost there."""
-        self._imu_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
-
-    def _alternative(self) -> Hypothesis | None:
-        """The alternative hypothesis at the newest sample."""
-        other = self.belief.alternative
-        return other and self._carried(other, self.imu.newest_ns)
-
     def contradicting(self) -> Estimate | None:
         """The alternative estimate at the newest sample, if the latest poses contradict the main one and support it."""
         other = self.belief.alternative
@@ -95,54 +72,10 @@ class History:
             return None
         return self._carried(other, self.imu.newest_ns).estimate
 
-    def _forget_old(self) -> None:
-        """Remove what is older than any pose that may still be inserted."""
-        horizon_ns = self.imu.newest_ns - self._kept_ns
-        if self.belief.stamp_ns < horizon_ns and self.belief.main is None:
-            # Initialising, and no pose for that long: only the hypothesis carried to the present is needed.
-            self._beliefs = [self.belief._replace(alternative=self._alternative())]
-        while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
-            del self._beliefs[0]
-        oldest = self._beliefs[0]
-        del self._poses[: bisect_right(self._poses, oldest.verdict.stamp_ns, key=_stamp)]
-        self.imu.forget_before(min(horizon_ns, oldest.stamp_ns) if oldest.hypotheses else horizon_ns)
-        kept = {pose.stamp_ns for pose in self._poses}
-        self._camera_steps = {stamp: step for stamp, step in self._camera_steps.items() if stamp in kept}
-        self._imu_steps = [step for step in self._imu_steps if step[0] >= self.imu.oldest_ns]
-
-    def insert(self, pose: CameraPose, camera_step_ns: int = 0) -> None:
-        """Add a pose; :meth:`take_in` applies it once the samples reach its instant.
-
-        ``camera_step_ns``: size of a step of the camera's clock since the last pose, if one is suspected.
-        """
-        if camera_step_ns:
-            self._camera_steps[pose.stamp_ns] = camera_step_ns
-        insort(self._poses, pose, key=_stamp)
-        self._undo_from(pose.stamp_ns)
-
-    def suspect_camera_step(self, stamp_ns: int, size_ns: int) -> None:
-        """Allow for a step of the camera's clock by ``size_ns`` before the first kept pose from ``stamp_ns`` on."""
-        since = bisect_left(self._poses, stamp_ns, key=_stamp)
-        if since < len(self._poses):
-            first_ns = self._poses[since].stamp_ns
-            self._camera_steps[first_ns] = size_ns
-            self._undo_from(first_ns)
-
-    def discard(self, stamps_ns: Iterable[int]) -> None:
-        """Remove poses by their stamps."""
-        stamps = {pose.stamp_ns for pose in self._poses} & set(stamps_ns)
-        self._poses = [pose for pose in self._poses if pose.stamp_ns not in stamps]
-        if stamps:
-            self._undo_from(min(stamps))
-
-    def _undo_from(self, stamp_ns: int) -> None:
-        """Remove the beliefs after poses of ``stamp_ns`` and later."""
-        while len(self._beliefs) > 1 and self.belief.verdict.stamp_ns >= stamp_ns:
-            del self._beliefs[-1]
-            self.main = self.belief.main
-        if not self.belief.hypotheses:
-            # Another pose begins the initialisation.
-            self._beliefs[-1] = self.belief._replace(first_offset=0.0)
+    def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None, first_offset: float = 0.0) -> int:
+        """Instant of a pose in the IMU's clock, by the clock offset of ``hypothesis``; without one ``first_offset``."""
+        offset = hypothesis.estimate.state.time_offset if hypothesis else first_offset
+        return pose.stamp_ns + self._offset_ns + round(offset * SECOND_NS)
 
     def untimely(self, pose: CameraPose) -> str:
         """Why a pose with this stamp cannot be inserted; empty if it can."""
@@ -156,11 +89,6 @@ class History:
             return 'refused: too late'
         return 'refused: stamp repeated' if any(pose.stamp_ns == known.stamp_ns for known in self._poses) else ''
 
-    def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None, first_offset: float = 0.0) -> int:
-        """Instant of a pose in the IMU's clock, by the clock offset of ``hypothesis``; without one ``first_offset``."""
-        offset = hypothesis.estimate.state.time_offset if hypothesis else first_offset
-        return pose.stamp_ns + self._offset_ns + round(offset * SECOND_NS)
-
     def compared(self, pose: CameraPose) -> Innovation | None:
         """Innovation of a pose that is not inserted, against the estimate at its instant; None without one."""
         for belief in reversed(self._beliefs):
@@ -169,9 +97,49 @@ class History:
                 return self._innovation(belief.main, pose)
         return None
 
+    # --- poses, and suspected steps of the clocks -----------------------------------------------------
+
+    def insert(self, pose: CameraPose, camera_step_ns: int = 0) -> None:
+        """Add a pose; :meth:`take_in` applies it once the samples reach its instant.
+
+        ``camera_step_ns``: size of a step of the camera's clock since the last pose, if one is suspected.
+        """
+        if camera_step_ns:
+            self._camera_steps[pose.stamp_ns] = camera_step_ns
+        insort(self._poses, pose, key=_stamp)
+        self._undo_from(pose.stamp_ns)
+
+    def discard(self, stamps_ns: Iterable[int]) -> None:
+        """Remove poses by their stamps."""
+        stamps = {pose.stamp_ns for pose in self._poses} & set(stamps_ns)
+        self._poses = [pose for pose in self._poses if pose.stamp_ns not in stamps]
+        if stamps:
+            self._undo_from(min(stamps))
+
+    def suspect_camera_step(self, stamp_ns: int, size_ns: int) -> None:
+        """Allow for a step of the camera's clock by ``size_ns`` before the first kept pose from ``stamp_ns`` on."""
+        since = bisect_left(self._poses, stamp_ns, key=_stamp)
+        if since < len(self._poses):
+            first_ns = self._poses[since].stamp_ns
+            self._camera_steps[first_ns] = size_ns
+            self._undo_from(first_ns)
+
+    def suspect_imu_step(self, size_ns: int) -> None:
+        """Allow for a step of the IMU's clock by ``size_ns`` after the newest sample: or samples are lost there."""
+        self._imu_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
+
     def forget_poses(self) -> None:
         """Remove all poses and beliefs."""
         self._poses, self._beliefs, self.main = [], [Belief()], None
+
+    def _undo_from(self, stamp_ns: int) -> None:
+        """Remove the beliefs after poses of ``stamp_ns`` and later."""
+        while len(self._beliefs) > 1 and self.belief.verdict.stamp_ns >= stamp_ns:
+            del self._beliefs[-1]
+            self.main = self.belief.main
+        if not self.belief.hypotheses:
+            # Another pose begins the initialisation.
+            self._beliefs[-1] = self.belief._replace(first_offset=0.0)
 
     # --- taking in poses ------------------------------------------------------------------------------
 
@@ -212,24 +180,6 @@ class History:
                 return
             del self._beliefs[-1]
 
-    def _relinearise(self, belief: Belief) -> bool:
-        """Return to before an initialisation that ends with ``belief`` if it must begin once more; whether it must.
-
-        A pose measures the state at the camera's stamp, to first order in the clock offset. In a brisk start with an
-        offset of two standard deviations the second order is larger than the errors of the poses.
-        """
-        before = self.belief
-        if before.main or belief.main is None or before.first_offset:
-            return False
-        forgotten = all(old.hypotheses for old in self._beliefs)
-        if forgotten or not relinearises(belief.main, before.first_offset):
-            return False
-        while self.belief.hypotheses:
-            del self._beliefs[-1]
-        offset = belief.main.estimate.state.time_offset
-        self._beliefs[-1] = self.belief._replace(first_offset=offset)
-        return True
-
     def _after(self, pose: CameraPose) -> Belief:
         """The belief after the next pose."""
         config, verdict = self.config, PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)
@@ -251,16 +201,6 @@ class History:
                 belief = belief._replace(contradiction=contradiction(config, other, innovation))
         return belief.settled(config)
 
-    def _innovation(self, hypothesis: Hypothesis, pose: CameraPose) -> Innovation:
-        """Innovation of a pose against a hypothesis at its instant, never earlier than where the hypothesis is now."""
-        time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
-        estimate = self._carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate
-        if step_ns := self._camera_steps.get(pose.stamp_ns, 0):
-            estimate = estimate.after_camera_step(step_ns / SECOND_NS)
-        motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)
-        measured = body_pose(pose, estimate.state.T_body_camera, self.config.pose_noise_scale)
-        return innovation_of(self.config, estimate, measured, motion)
-
     def _begun(self, belief: Belief, pose: CameraPose) -> Belief:
         """``belief``, which is empty, with an alternative hypothesis begun from a pose."""
         time_ns = max(self.due_ns(pose, None, belief.first_offset), self.imu.oldest_ns)
@@ -280,3 +220,65 @@ class History:
         drifted = begun.needed == 0 or (belief.drifted and main.refused_in_row > 1)
         begun = begun._replace(needed=0) if drifted else begun
         return belief._replace(alternative=begun, hits_before=main.hits, drifted=drifted)
+
+    def _relinearise(self, belief: Belief) -> bool:
+        """Return to before an initialisation that ends with ``belief`` if it must begin once more; whether it must.
+
+        A pose measures the state at the camera's stamp, to first order in the clock offset. In a brisk start with an
+        offset of two standard deviations the second order is larger than the errors of the poses.
+        """
+        before = self.belief
+        if before.main or belief.main is None or before.first_offset:
+            return False
+        forgotten = all(old.hypotheses for old in self._beliefs)
+        if forgotten or not relinearises(belief.main, before.first_offset):
+            return False
+        while self.belief.hypotheses:
+            del self._beliefs[-1]
+        offset = belief.main.estimate.state.time_offset
+        self._beliefs[-1] = self.belief._replace(first_offset=offset)
+        return True
+
+    def _innovation(self, hypothesis: Hypothesis, pose: CameraPose) -> Innovation:
+        """Innovation of a pose against a hypothesis at its instant, never earlier than where the hypothesis is now."""
+        time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
+        estimate = self._carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate
+        if step_ns := self._camera_steps.get(pose.stamp_ns, 0):
+            estimate = estimate.after_camera_step(step_ns / SECOND_NS)
+        motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)
+        measured = body_pose(pose, estimate.state.T_body_camera, self.config.pose_noise_scale)
+        return innovation_of(self.config, estimate, measured, motion)
+
+    def _carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
+        """A hypothesis propagated along the samples to an instant that is not later than the newest sample."""
+        estimate = hypothesis.estimate
+        if estimate.stamp_ns >= until_ns:
+            return hypothesis
+        for begin_ns, std in self._imu_steps:
+            if not estimate.stamp_ns <= begin_ns < until_ns:
+                continue
+            if begin_ns > estimate.stamp_ns:
+                estimate = propagated(estimate, self.imu.steps(estimate.stamp_ns, begin_ns), begin_ns, self.walks)
+            estimate = estimate.after_imu_step(self.imu.at(begin_ns), std)
+        steps = self.imu.steps(estimate.stamp_ns, until_ns)
+        return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self.walks))
+
+    def _alternative(self) -> Hypothesis | None:
+        """The alternative hypothesis at the newest sample."""
+        other = self.belief.alternative
+        return other and self._carried(other, self.imu.newest_ns)
+
+    def _forget_old(self) -> None:
+        """Remove what is older than any pose that may still be inserted."""
+        horizon_ns = self.imu.newest_ns - self._kept_ns
+        if self.belief.stamp_ns < horizon_ns and self.belief.main is None:
+            # Initialising, and no pose for that long: only the hypothesis carried to the present is needed.
+            self._beliefs = [self.belief._replace(alternative=self._alternative())]
+        while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
+            del self._beliefs[0]
+        oldest = self._beliefs[0]
+        del self._poses[: bisect_right(self._poses, oldest.verdict.stamp_ns, key=_stamp)]
+        self.imu.forget_before(min(horizon_ns, oldest.stamp_ns) if oldest.hypotheses else horizon_ns)
+        kept = {pose.stamp_ns for pose in self._poses}
+        self._camera_steps = {stamp: step for stamp, step in self._camera_steps.items() if stamp in kept}
+        self._imu_steps = [step for step in self._imu_steps if step[0] >= self.imu.oldest_ns]
