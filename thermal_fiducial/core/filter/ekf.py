@@ -116,22 +116,17 @@ class PoseEkf:
 
         ``pose.stamp_ns`` is in the camera's clock; the clock offset, parameter and estimate, is added here.
         """
-        update = self._add_pose(pose)
-        return replace(update, stamp_ns=pose.stamp_ns)
-
-    def _add_pose(self, pose: CameraPose) -> PoseUpdate:
-        off_grid_ns = self._frame_grid.off_grid(pose.stamp_ns) if self._config.estimate_time_offset else 0
+        stamp_ns = pose.stamp_ns
+        off_grid_ns = self._frame_grid.off_grid(stamp_ns) if self._config.estimate_time_offset else 0
         if self._T_map_first is not None:
             pose = in_moved_map(pose, inverse(self._T_map_first))
         pose = self._in_present_clock(pose)
-        if self._history.main is None and self._camera_clock.in_question:
-            return PoseUpdate(pose.stamp_ns, False, CLOCK_JUMPED, np.nan)
         if reason := self._unusable(pose):
-            return PoseUpdate(pose.stamp_ns, False, reason, np.nan)
+            return PoseUpdate(stamp_ns, False, reason, np.nan)
         self._history.insert(pose, off_grid_ns)
         self._history.take_in()
-        waiting = PoseUpdate(pose.stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
-        return self._history.log.latest.get(pose.stamp_ns, waiting)
+        waiting = PoseUpdate(stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
+        return replace(self.decided.get(pose.stamp_ns, waiting), stamp_ns=stamp_ns)
 
     def _in_present_clock(self, pose: CameraPose) -> CameraPose:
         """``pose`` with all steps of the camera's clock taken out of its stamp, a step that it reveals included."""
@@ -193,6 +188,8 @@ class PoseEkf:
 
     def _unusable(self, pose: CameraPose) -> str:
         """Why a pose cannot be used; empty if it can."""
+        if self._history.main is None and self._camera_clock.in_question:
+            return CLOCK_JUMPED
         if not np.isfinite(pose.T_map_camera).all():
             return 'refused: not finite'
         try:
@@ -274,10 +271,9 @@ class PoseEkf:
     @property
     def usable_for(self) -> float:
         """Seconds [s] until the position is worse than ``lost_position_std`` if no further pose arrives."""
-        main = self._history.main
+        history, main = self._history, self._history.main
         if main is None:
             return 0.0
-        history = self._history
         return usable_seconds(main.estimate, history.imu.last.densities, history.walks, self._config.lost_position_std)
 
     def diagnostics(self) -> dict[str, float]:
