@@ -59,13 +59,6 @@ class PoseEkf:
         #: on the last IMU sample
         self._verdict = Verdict.USE
 
-    def _begin_after_jump(self) -> None:
-        """Reset, but keep the estimated clock offset: where stamps jump, mostly samples are missing."""
-        self._restart_reason = CLOCK_JUMPED
-        main, known = self._history.main, self.camera_time_offset is not None
-        learned = main.estimate.state.time_offset if main and known else 0.0
-        self._begin(self._first_offset + learned)
-
     # --- input ----------------------------------------------------------------------------------------
 
     def add_imu(self, sample: ImuSample) -> Odometry | None:
@@ -128,6 +121,27 @@ class PoseEkf:
         waiting = PoseUpdate(stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
         return replace(self.decided.get(pose.stamp_ns, waiting), stamp_ns=stamp_ns)
 
+    def _unusable(self, pose: CameraPose) -> str:
+        """Why a pose cannot be used; empty if it can."""
+        if self._history.main is None and self._camera_clock.in_question:
+            return CLOCK_JUMPED
+        if not np.isfinite(pose.T_map_camera).all():
+            return 'refused: not finite'
+        try:
+            checked_covariance(pose.covariance, 'covariance')
+        except InputError as error:
+            return f'refused: {error}'
+        return self._history.untimely(pose)
+
+    def move_map(self, T_new_old: FloatArray) -> None:
+        """Follow a correction of the map: T_new = T_new_old @ T_old. Of an initialisation, poses in the old map go."""
+        if self._history.main is None:
+            self._history.forget_poses()
+            return
+        self._T_map_first = T_new_old if self._T_map_first is None else T_new_old @ self._T_map_first
+
+    # --- steps of the clocks --------------------------------------------------------------------------
+
     def _in_present_clock(self, pose: CameraPose) -> CameraPose:
         """``pose`` with all steps of the camera's clock taken out of its stamp, a step that it reveals included."""
         history, pose = self._history, self._camera_clock.stamped(pose)
@@ -150,6 +164,13 @@ class PoseEkf:
         history.discard(self._camera_clock.follow(step_ns))
         self._history.take_in()
         return restamped
+
+    def _begin_after_jump(self) -> None:
+        """Reset, but keep the estimated clock offset: where stamps jump, mostly samples are missing."""
+        self._restart_reason = CLOCK_JUMPED
+        main, known = self._history.main, self.camera_time_offset is not None
+        learned = main.estimate.state.time_offset if main and known else 0.0
+        self._begin(self._first_offset + learned)
 
     def _allow_for_step(self, size_ns: int) -> None:
         """Leave a step of the camera's clock to the offset: since its first pose that may be off by ``size_ns``.
@@ -178,25 +199,6 @@ class PoseEkf:
         """Whether a pose can be used, and passes the gate if the clock offset is treated as unknown."""
         innovation = self._history.compared(pose)
         return innovation is not None and is_of_unknown_clock(self._config, innovation) and not self._unusable(pose)
-
-    def move_map(self, T_new_old: FloatArray) -> None:
-        """Follow a correction of the map: T_new = T_new_old @ T_old. Of an initialisation, poses in the old map go."""
-        if self._history.main is None:
-            self._history.forget_poses()
-            return
-        self._T_map_first = T_new_old if self._T_map_first is None else T_new_old @ self._T_map_first
-
-    def _unusable(self, pose: CameraPose) -> str:
-        """Why a pose cannot be used; empty if it can."""
-        if self._history.main is None and self._camera_clock.in_question:
-            return CLOCK_JUMPED
-        if not np.isfinite(pose.T_map_camera).all():
-            return 'refused: not finite'
-        try:
-            checked_covariance(pose.covariance, 'covariance')
-        except InputError as error:
-            return f'refused: {error}'
-        return self._history.untimely(pose)
 
     # --- output ---------------------------------------------------------------------------------------
 
