@@ -188,7 +188,7 @@ def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
     return count * covariance
 
 
-# Odometry.
+# Errors that many poses have in common.
 
 
 def of_correlated_poses(covariance: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
 from thermal_fiducial.core.types import FloatArray
 
 #: Right sides (F, 6, k) and (M + 1, 6, k) of the normal equations.
-Sides = tuple[FloatArray, FloatArray]
+RightSides = tuple[FloatArray, FloatArray]
 #: Draws that are propagated at a time, which bounds the memory.
 _AT_ONCE = 32
 
@@ -61,7 +61,7 @@ class ErrorSources:
         of_frame = np.sqrt(widened) * root_of(problem.odometry.weighted(self.now.camera_chi2))
         of_marker = np.sqrt(widened) * root_of(problem.known.weighted(self.now.marker_chi2))
 
-        def sides(_: slice) -> Sides:
+        def sides(_: slice) -> RightSides:
             of_views = roots * self._normal(len(roots), 8)
             of_odometry = of_frame @ self._normal(len(of_frame), 6)
             return problem.sides(self.now, of_views, of_odometry, of_marker @ self._normal(len(of_marker), 6))
@@ -83,7 +83,7 @@ class ErrorSources:
 
         no_priors = [np.zeros((number, 6, _AT_ONCE)) for number in (len(problem.stamps), len(problem.ids))]
 
-        def sides(chosen: slice) -> Sides:
+        def sides(chosen: slice) -> RightSides:
             off = (shapes * self._normal(len(shapes), 4, 2))[problem.marker]
             for own, lens in zip(views, lenses, strict=True):
                 off[own] += lens.drawn(chosen)
@@ -92,7 +92,7 @@ class ErrorSources:
 
         return self._solved(sides)
 
-    def _solved(self, sides: Callable[[slice], Sides]) -> FloatArray:
+    def _solved(self, sides: Callable[[slice], RightSides]) -> FloatArray:
         """Errors (M, 6, K) by right sides of the normal equations, which come for some of the draws at a time."""
         chosen = (slice(first, first + _AT_ONCE) for first in range(0, DRAWS, _AT_ONCE))
         return np.concatenate([self.system.solve(*sides(some))[1][:-1] for some in chosen], axis=-1)
