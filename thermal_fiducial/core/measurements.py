@@ -117,6 +117,13 @@ def marker_rows(
     return np.asarray(rows[usable[np.argsort(ids[usable], kind='stable')]])
 
 
+def places_of(rows: Markers) -> tuple[dict[int, tuple[FloatArray, float]], frozenset[int]]:
+    """ID to T_map_marker (4, 4) and side [m] of rows of :data:`MAP_DTYPE`; IDs of those that are in quarantine."""
+    T = transform_from_quaternion(columns(rows, ('x', 'y', 'z')), columns(rows, ('qx', 'qy', 'qz', 'qw')))
+    places = {int(row['id']): (T_map_marker, float(row['size'])) for row, T_map_marker in zip(rows, T, strict=True)}
+    return places, frozenset(rows['id'][rows['trusted'] == 0].tolist())
+
+
 def corners_px(markers: Markers) -> FloatArray:
     """Corners (N, 4, 2) [px] in the raw image, clockwise from the marker's top-left."""
     return _numbers(markers, _CORNERS).reshape(-1, 4, 2)

@@ -9,8 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from thermal_fiducial.config import (
     ArucoDetectorConfig,
     check_names,
@@ -28,13 +26,12 @@ from thermal_fiducial.core.geometry.se3 import (
     quaternion_from_rotation,
     rotation_from_quaternion,
     transform,
-    transform_from_quaternion,
 )
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.mapping.keyframes import VIEWS
 from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.measurements import ImuSample, Markers, Odometry
+from thermal_fiducial.core.measurements import ImuSample, Markers, Odometry, places_of
 from thermal_fiducial.core.motion_prior import MotionPrior, possible
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
@@ -154,12 +151,4 @@ class Pipeline:
 
     def _share_map(self) -> None:
         """Give the detector the map, as the ``marker_map`` topic does."""
-        rows = self.mapper.map.rows()
-        poses = transform_from_quaternion(
-            np.stack([rows[name] for name in 'xyz'], axis=-1),
-            np.stack([rows[name] for name in ('qx', 'qy', 'qz', 'qw')], axis=-1),
-        )
-        self.detector.set_map(
-            {int(row['id']): (pose, float(row['size'])) for row, pose in zip(rows, poses, strict=True)},
-            rows['id'][rows['trusted'] == 0].tolist(),
-        )
+        self.detector.set_map(*places_of(self.mapper.map.rows()))

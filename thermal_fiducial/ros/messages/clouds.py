@@ -13,7 +13,6 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE, LARGEST_VARIANCE
-from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import (
     columns,
     CORNER_COVARIANCE_FIELDS,
@@ -22,6 +21,7 @@ from thermal_fiducial.core.measurements import (
     MAP_DTYPE,
     MARKER_DTYPE,
     Markers,
+    places_of,
 )
 from thermal_fiducial.core.types import FloatArray, LARGEST_ID
 from thermal_fiducial.errors import InputError
@@ -237,6 +237,4 @@ def map_poses(message: PointCloud2) -> tuple[dict[int, tuple[FloatArray, float]]
     possible &= (rows['size'] > 0.0) & (rows['size'] < _LARGEST_MARKER)
     if not possible.all():
         raise InputError(f'marker_map with marker {rows["id"][~possible][0]} of an impossible pose or size')
-    T = transform_from_quaternion(positions, quaternions)
-    poses = {int(row['id']): (T_map_marker, float(row['size'])) for row, T_map_marker in zip(rows, T, strict=True)}
-    return poses, frozenset(rows['id'][rows['trusted'] == 0].tolist())
+    return places_of(rows)
