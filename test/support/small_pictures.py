@@ -50,8 +50,21 @@ def _drawn(fine, cells, corners, fall=0.0):
     source = np.float32([[low, low], [high, low], [high, high], [low, high]])
     place = np.float32((corners + 0.5) * _FINE - 0.5)
     warp = cv2.getPerspectiveTransform(source, place)
-    shown = cv2.warpPerspective(texture, warp, fine.shape[::-1], flags=cv2.INTER_NEAREST, borderValue=-1.0)
-    fine[shown >= 0.0] = shown[shown >= 0.0]
+    (left, top), (right, bottom) = _bounds(warp, len(texture), fine.shape)
+    seen = fine[top:bottom, left:right]
+    moved = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]]) @ warp
+    shown = cv2.warpPerspective(texture, moved, seen.shape[::-1], flags=cv2.INTER_NEAREST, borderValue=-1.0)
+    seen[shown >= 0.0] = shown[shown >= 0.0]
+
+
+def _bounds(warp, width, shape):
+    """First and last fine pixel (x, y) that a texture (width, width) can reach, within a scene of ``shape``."""
+    reach = np.array([[[-1.0, -1.0], [width, -1.0], [width, width], [-1.0, width]]])
+    reached = cv2.perspectiveTransform(reach, warp)[0]
+    limits = shape[::-1]
+    first = np.clip(np.floor(reached.min(axis=0)), 0, limits).astype(int)
+    last = np.clip(np.ceil(reached.max(axis=0)) + 1, first + 1, limits).astype(int)
+    return first.tolist(), last.tolist()
 
 
 def _scene(rng):
