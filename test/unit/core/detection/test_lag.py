@@ -182,13 +182,13 @@ def test_lag_of_a_marker_that_grows_is_removed_though_its_centre_stays():
 @pytest.mark.parametrize('lag_blur', [(10.0, 0.0), (-8.0, 5.0)])
 def test_corners_are_right_where_motion_blur_is_longer_than_cells(lag_blur):
     """A marker with cells of 5 px, which lag displaces by 10 px in the mean."""
-    fine, cell, place = 8, 5, 100
+    fine, cell, place = 8, 5, 60
     decoder, marker_id = Decoder(load_dictionary('DICT_4X4_50').bits), np.array([13])
     pattern = decoder.patterns(marker_id, np.zeros_like(marker_id))[0]
     pattern = np.kron(np.pad(pattern, 1, constant_values=1), np.ones((cell * fine, cell * fine)))
     scene = np.pad(pattern.astype(np.float32), place * fine)
     # The response at some ages, evenly spread in what they weigh.
-    ages = -np.log(1.0 - (np.arange(400) + 0.5) / 400)
+    ages = -np.log(1.0 - (np.arange(100) + 0.5) / 100)
     seen = sum(moved(scene, fine * np.array(lag_blur) * age) for age in ages) / len(ages)
     size = scene.shape[0] // fine
     image = cv2.resize(cv2.GaussianBlur(seen, (0, 0), 0.6 * fine), (size, size), interpolation=cv2.INTER_AREA)
