@@ -7,6 +7,7 @@ frame, shows the shutter, or pauses, depending on the driver.
 
 from collections import deque
 from dataclasses import dataclass
+from statistics import median
 
 import cv2
 import numpy as np
@@ -30,6 +31,8 @@ _SHIFTED = 2
 # carry: flags look alike only between a pixel near nought and one near full scale. After so many frames in a row with
 # carries, later frames need not show any: a single frame may be garbled.
 _NEARLY, _FEWEST_CARRIES, _FRAMES_WITH_CARRIES = 3, 8, 3
+# Frames in a row that must show another shift for it to replace one: a single frame may be garbled.
+_FRAMES_WITH_SHIFT = 3
 # Rows of an image; a frame with up to MAX_TELEMETRY_ROWS more carries telemetry.
 STANDARD_HEIGHTS = (1024, 512, 480, 256, 240, 128, 120)
 MAX_TELEMETRY_ROWS = 4
@@ -63,6 +66,8 @@ class FrameCleaner:
         #: shift of the counts; frames in a row that show carries into the bits that are masked otherwise, as those of a
         #: radiometric camera, which fills all 16: after a few of them frames without carries are believed too
         self._shift = self._carrying = 0
+        #: frames in a row that show another shift; the first one decides at once
+        self._other_shift = _FRAMES_WITH_SHIFT
         self._restart((0, 0))
 
     def _restart(self, shape: tuple[int, int]) -> None:
@@ -133,11 +138,9 @@ class FrameCleaner:
         # Some drivers shift counts up; without a shift, noise sets the lowest bits of some pixels. A shift shows where
         # counts need more bits than they have, and stays; a frame of nothing but zeros has no lowest bit.
         used = int(np.bitwise_or.reduce(sample, axis=None))
-        shift = (used & -used).bit_length() - 1
-        if 0 <= shift < _SHIFTED:
-            self._shift = 0
-        elif used >> bits and not self._shift:
-            self._shift = shift
+        lowest = (used & -used).bit_length() - 1
+        if 0 <= lowest < _SHIFTED or used >> bits:
+            self._believe_shift(lowest if lowest >= _SHIFTED else 0)
         if self._shift:
             counts >>= np.uint16(self._shift)
         elif used >> bits and self._carrying < _FRAMES_WITH_CARRIES:
@@ -145,6 +148,12 @@ class FrameCleaner:
         if not self._carrying:
             counts &= np.uint16((1 << bits) - 1)
         return counts
+
+    def _believe_shift(self, shown: int) -> None:
+        """Take over the shift that a frame shows, unless the frame stands alone with it."""
+        self._other_shift = self._other_shift + 1 if shown != self._shift else 0
+        if self._other_shift >= _FRAMES_WITH_SHIFT:
+            self._shift, self._other_shift = shown, 0
 
     def _without_telemetry(self, frame: Counts | Gray, extra: int) -> Counts | Gray:
         """Without ``extra`` rows that carry no image, from the side where the picture breaks off."""
@@ -275,12 +284,13 @@ class ShutterDetector:
     COLLAPSE = 0.25
     # Longest shutter event; a picture that is flat for longer is a flat scene.
     LONGEST_NS = 1_500_000_000
-    SMOOTHING = 0.2
+    # Latest frames whose median structure is that of the scene, and the fewest for it to be known: one may be garbled.
+    FRAMES, ENOUGH = 5, 3
     # Fewer pixels have too few patches (8x8 px) to distinguish structure from noise.
     LEAST_PIXELS = 50 * 64
 
     def __init__(self) -> None:
-        self._live_structure: float | None = None
+        self._live: deque[float] = deque(maxlen=self.FRAMES)
         self._closed_ns: int | None = None
 
     def closed(self, stamp_ns: int, image: Counts) -> bool:
@@ -288,15 +298,14 @@ class ShutterDetector:
         if image.size < self.LEAST_PIXELS:
             return False
         structure = _structure(image)
-        before = self._live_structure
-        collapsed = before is not None and structure < self.COLLAPSE * before
+        collapsed = len(self._live) >= self.ENOUGH and structure < self.COLLAPSE * median(self._live)
         if collapsed and structure < self.FLAT_SIGMAS * pixel_noise(image):
             self._closed_ns = stamp_ns if self._closed_ns is None else self._closed_ns
             if stamp_ns - self._closed_ns < self.LONGEST_NS:
                 return True
-            before = None
+            self._live.clear()
         self._closed_ns = None
-        self._live_structure = structure if before is None else before + self.SMOOTHING * (structure - before)
+        self._live.append(structure)
         return False
 
 

@@ -248,6 +248,25 @@ def test_dead_pixels_before_a_clipped_sky_do_not_freeze_it(sky):
     assert camera(torn).reason == FROZEN
 
 
+@pytest.mark.parametrize('garbled', [0x8000, 0xFFFF])
+def test_a_garbled_first_frame_does_not_decide_on_the_shift(garbled):
+    """The memory of a driver before its first frame, say; believed, the shift of 15 would leave two counts."""
+    camera, rng = Camera(), np.random.default_rng(6)
+    camera(np.full((512, 640), garbled, np.uint16))
+    later = [(counts, camera(counts << np.uint16(2))) for counts in (noisy(scene(), rng) for _ in range(6))]
+    assert all(np.array_equal(result.counts, counts) for counts, result in later[-2:])
+
+
+def test_one_garbled_frame_does_not_end_a_shift():
+    """The scene has cooled below 4096 counts since the shift has shown."""
+    camera, rng = Camera(), np.random.default_rng(6)
+    hot = noisy(scene(), rng)
+    camera(hot << np.uint16(2))
+    camera(rng.integers(0, 1 << 16, hot.shape).astype(np.uint16))
+    cold = hot - np.uint16(3500)
+    assert np.array_equal(camera(cold << np.uint16(2)).counts, cold)
+
+
 # --- shutter -------------------------------------------------------------------------------------------
 
 
@@ -286,6 +305,18 @@ def test_a_hot_object_that_leaves_does_not_hide_cooler_markers():
     hot[400:500, 540:640] += 2500.0
     assert all(camera(noisy(hot, rng)).reason == '' for _ in range(5))
     assert all(camera(noisy(scene(contrast=25.0), rng)).reason == '' for _ in range(5))
+
+
+def test_the_frame_after_a_garbled_one_is_no_shutter_although_its_scene_is_faint():
+    """Beside a garbled frame all structure has gone; four times the noise is left of the markers."""
+    rng = np.random.default_rng(13)
+    faint = scene(contrast=4.0 * NOISE)
+    for before in (0, 1, 8):
+        camera = Camera()
+        for _ in range(before):
+            camera(noisy(faint, rng))
+        camera(rng.integers(0, 1 << 14, faint.shape).astype(np.uint16))
+        assert all(camera(noisy(faint, rng)).reason == '' for _ in range(5))
 
 
 # --- stamps --------------------------------------------------------------------------------------------
