@@ -84,21 +84,23 @@ class _MapInProgress:
     """The file of a new map; changes to it since the command began are not overwritten."""
 
     path: Path
+    #: ``build`` or ``refine``, and what from
     action: str
+    source: Path
     read: str
 
     @classmethod
-    def of(cls, path: Path, action: str) -> '_MapInProgress':
+    def of(cls, path: Path, action: str, source: Path) -> '_MapInProgress':
         """The file at ``path`` as it is now."""
-        return cls(path, action, digest(path))
+        return cls(path, action, source, digest(path))
 
     def save(self, marker_map: MarkerMap) -> None:
         """Write the map. Raises InputError if the file has changed or cannot be written."""
-        save_with_history(self.path, marker_map, self.action, self.read)
+        save_with_history(self.path, marker_map, f'{self.action} from {self.source.name}', self.read)
 
 
 def _build(args: argparse.Namespace) -> int:
-    work = _MapInProgress.of(args.out, f'build from {args.images.name}')
+    work = _MapInProgress.of(args.out, 'build', args.images)
     camera = load_camera(args.calibration)
     start = _start(args)
     args.marker_size = args.marker_size or _only_size(start)
@@ -114,7 +116,7 @@ def _build(args: argparse.Namespace) -> int:
 
 def _refine(args: argparse.Namespace) -> int:
     require_regular(args.map)
-    work = _MapInProgress.of(args.out or args.map, f'refine from {args.run_folder.name}')
+    work = _MapInProgress.of(args.out or args.map, 'refine', args.run_folder)
     file = args.run_folder
     if file.is_dir():
         file /= 'detections.csv'
@@ -157,6 +159,8 @@ def _grow(
     with progress_bar('mapping') as progress:
         built = build_map(frames, camera, start, config, lambda markers, share: progress(share, f'{markers} markers'))
     _print_what_was_used(built, len(frames), names)
+    if not built.frames_used:
+        raise InputError(f'{work.source}: no frame of it gives a pose in the map; {work.path} is left as it is')
     work.save(built.map)
     print(f'{work.path}: {built.map.size_in_words}')
     return 2 if any(doubt.spoils for doubt in say_doubts(built.map, work.path)) else 0

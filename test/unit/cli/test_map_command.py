@@ -266,6 +266,17 @@ def test_refine_counts_the_frames_that_gave_nothing_by_reason(path, poses, photo
     assert '30 of 32 frames used\n2 not used: no known marker in view\n' in capsys.readouterr().out
 
 
+def test_refine_with_a_run_that_shows_nothing_of_the_map_leaves_it_and_fails(path, poses, photographed, capsys):
+    """A run of another hall, say: a script must not go on as if the map had been refined."""
+    save_map(path, MarkerMap({40: MapMarker(40, SIZE, True, poses[0]), 41: MapMarker(41, SIZE, False, poses[1])}))
+    before = path.read_text()
+    assert run('--marker-size', SIZE, 'refine', path, *photographed) == 2
+    captured = capsys.readouterr()
+    assert '30 not used: no known marker in view' in captured.out
+    assert 'no frame of it gives a pose in the map' in captured.err
+    assert path.read_text() == before
+
+
 @pytest.mark.parametrize(('column', 'value'), [(1, '0.5'), (10, '0'), (10, '-1'), (10, '1e12')])
 def test_refine_refuses_ids_and_errors_that_no_marker_has(path, poses, photographed, capsys, column, value):
     save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
