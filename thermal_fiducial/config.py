@@ -35,6 +35,7 @@ def param(
     unit: str = '',
     minimum: float | None = None,
     maximum: float | None = None,
+    least: float = 0.0,
     choices: tuple[str, ...] = (),
     length: int | None = None,
     normed: bool = False,
@@ -51,6 +52,7 @@ def param(
     description : one sentence for ``ros2 param describe``
     unit : appended to the description in brackets
     minimum, maximum : inclusive range of a number or of each number of a tuple
+    least : smallest value beside 0, which stands for none: a rate or a period is divided by
     choices : the allowed values of a string
     length : number of elements of a tuple of floats
     normed : whether the tuple must have unit norm (a quaternion)
@@ -66,6 +68,7 @@ def param(
         'unit': unit,
         'minimum': minimum,
         'maximum': maximum,
+        'least': least,
         'choices': choices,
         'length': length,
         'normed': normed,
@@ -163,6 +166,9 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
         if (low is not None and not element >= low) or (high is not None and not element <= high):
             allowed = f'{low} .. {high} {limits["unit"]}'.rstrip()
             raise InputError(f'parameter {name}: {_shown(element)} is outside {allowed}')
+        if limits['least'] and 0.0 < element < limits['least']:
+            allowed = f'neither 0 nor at least {limits["least"]} {limits["unit"]}'
+            raise InputError(f'parameter {name}: {_shown(element)} is {allowed}')
     if limits['normed'] and not abs(math.hypot(*result) - 1.0) < _NORM_TOLERANCE:
         raise InputError(f'parameter {name}: {list(result)} is no unit quaternion')
     if limits['verify']:
@@ -202,6 +208,8 @@ def _typed(name: str, default: Any, length: int | None, value: Any) -> Any:
 def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f'parameter {name}: {_shown(value)} is not a number')
+    if math.isinf(value):
+        raise InputError(f'parameter {name}: {_shown(value)} is not finite')
     return float(value)
 
 
@@ -257,6 +265,7 @@ def _clock_random_walk(needs: tuple[str, ...]) -> Any:
         "Random walk of the camera's clock, against the IMU's and a second camera's.",
         unit='s/sqrt(s)',
         minimum=0.0,
+        maximum=0.1,
         needs=needs,
     )
 
@@ -362,6 +371,7 @@ class ImageRateParameters(ScheduleParameters):
         'Expected image rate for the diagnostics; 0: the rate of the first seconds.',
         unit='Hz',
         minimum=0.0,
+        least=0.01,
         maximum=1000.0,
     )
 
@@ -414,6 +424,7 @@ class Tau2CameraConfig(ImageRateParameters, FrameParameters, ImageParameters):
         '8-bit view: smallest range of the scale, so that noise alone does not fill it.',
         unit='counts',
         minimum=1.0,
+        maximum=65535.0,
         dynamic=True,
     )
 
@@ -606,6 +617,7 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
         'Period at which a changed map is written to <map_file>.autosave; 0: never.',
         unit='s',
         minimum=0.0,
+        least=1.0,
         maximum=3600.0,
         needs=('map_file',),
     )
@@ -671,8 +683,12 @@ class ImuNoise(SelfChecked):
         minimum=0.0,
         maximum=0.1,
     )
-    gyroscope_range: float = param(34.9, 'Readings beyond this are saturated.', unit='rad/s', minimum=0.1)
-    accelerometer_range: float = param(156.0, 'Readings beyond this are saturated.', unit='m/s^2', minimum=10.0)
+    gyroscope_range: float = param(
+        34.9, 'Readings beyond this are saturated.', unit='rad/s', minimum=0.1, maximum=100.0
+    )
+    accelerometer_range: float = param(
+        156.0, 'Readings beyond this are saturated.', unit='m/s^2', minimum=10.0, maximum=10000.0
+    )
     vibration: float = param(
         1.0,
         'Factor on the noise density measured under vibration (the spectral floor between the rotor tones), which '
@@ -709,13 +725,18 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         needs=('extrinsics_position_std or extrinsics_orientation_std',),
     )
     extrinsics_position_std: float = param(
-        0.002, 'Standard deviation of camera_position: what its calibration leaves. 0: exact.', unit='m', minimum=0.0
+        0.002,
+        'Standard deviation of camera_position: what its calibration leaves. 0: exact.',
+        unit='m',
+        minimum=0.0,
+        maximum=1.0,
     )
     extrinsics_orientation_std: float = param(
         0.002,
         'Standard deviation of camera_orientation: what its calibration leaves. 0: exact.',
         unit='rad',
         minimum=0.0,
+        maximum=1.0,
     )
     imu: ImuNoise = group(ImuNoise)  # noqa: RUF009
     gravity: float = param(9.80665, 'Local gravity.', unit='m/s^2', minimum=9.7, maximum=9.9)
@@ -726,18 +747,21 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         minimum=0.0,
         maximum=0.2,
     )
-    initial_velocity_std: float = param(3.0, 'Initial standard deviation of the velocity.', unit='m/s', minimum=0.01)
+    initial_velocity_std: float = param(
+        3.0, 'Initial standard deviation of the velocity.', unit='m/s', minimum=0.01, maximum=100.0
+    )
     initial_gyroscope_bias_std: float = param(
-        0.02, 'Initial standard deviation of the gyroscope bias.', unit='rad/s', minimum=0.0
+        0.02, 'Initial standard deviation of the gyroscope bias.', unit='rad/s', minimum=0.0, maximum=1.0
     )
     initial_accelerometer_bias_std: float = param(
-        0.2, 'Initial standard deviation of the accelerometer bias.', unit='m/s^2', minimum=0.0
+        0.2, 'Initial standard deviation of the accelerometer bias.', unit='m/s^2', minimum=0.0, maximum=10.0
     )
     initial_poses: int = param(3, 'Consistent poses needed to initialise the filter.', minimum=1, maximum=100)
     pose_noise_scale: float = param(
         1.0,
         'Factor on the standard deviation of the camera poses; larger scatter is estimated on top of it.',
         minimum=0.1,
+        maximum=1000.0,
         dynamic=True,
     )
     systematic_pose_std: float = param(
@@ -767,7 +791,9 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
     max_delay: float = param(
         1.0, 'Largest delay of a pose; later ones are refused.', unit='s', minimum=0.0, maximum=10.0
     )
-    max_imu_gap: float = param(1.0, 'Longest IMU gap or clock jump without a reset.', unit='s', minimum=0.01)
+    max_imu_gap: float = param(
+        1.0, 'Longest IMU gap or clock jump without a reset.', unit='s', minimum=0.01, maximum=10.0
+    )
     lost_position_std: float = param(
         0.3,
         'The pose is lost when the standard deviation of the position exceeds this.',
@@ -779,13 +805,18 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         60.0, 'Reset after this time without an accepted pose.', unit='s', minimum=1.0, dynamic=True
     )
     smoothing_time: float = param(
-        0.0, 'Time over which the smooth output spreads corrections; 0: no smooth output.', unit='s', minimum=0.0
+        0.0,
+        'Time over which the smooth output spreads corrections; 0: no smooth output.',
+        unit='s',
+        minimum=0.0,
+        maximum=60.0,
     )
     imu_rate: float = param(
         0.0,
         'Expected rate of imu/data for the diagnostics; 0: the rate of the first seconds.',
         unit='Hz',
         minimum=0.0,
+        least=0.01,
         maximum=10000.0,
     )
     map_frame: str = param('map', 'Frame of the pose.')
@@ -808,6 +839,7 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         'the smooth output with smoothing_time. 0: none.',
         unit='Hz',
         minimum=0.0,
+        least=0.1,
         maximum=1000.0,
     )
     px4: bool = param(
@@ -836,6 +868,7 @@ class ThermalSourceConfig(FrameParameters, ImageParameters):
         'Rate requested of a V4L2 device, or at which pictures are published; 0: as the device is set, pictures at 30.',
         unit='Hz',
         minimum=0.0,
+        least=0.01,
         maximum=1000.0,
     )
     repeat: bool = param(True, 'Restart a folder or video at its end.')

@@ -135,6 +135,36 @@ def test_no_constructor_keeps_a_dynamic_parameter():
     assert read == dynamic
 
 
+@pytest.mark.parametrize('kind', NODES)
+def test_no_number_may_be_infinite_or_nearly_a_division_by_zero(kind):
+    """Infinite standard deviations keep the filter from starting, 1e-300 Hz ends its node."""
+    for name, item, default in parameters(kind):
+        if not isinstance(default, float):
+            continue
+        with pytest.raises(InputError):
+            from_mapping(kind, {name: float('inf')})
+        unit = item.metadata['unit']
+        if unit == 'Hz' or name == 'autosave_period':
+            with pytest.raises(InputError, match=f'{name}: 1e-300 is neither 0 nor at least .* {unit}'):
+                from_mapping(kind, {name: 1e-300})
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [
+        ('extrinsics_position_std', 2.0),  # mm
+        ('extrinsics_orientation_std', 2.0),  # degrees
+        ('imu.gyroscope_range', 2000.0),  # degrees a second
+        ('initial_gyroscope_bias_std', 5.0),  # degrees a second
+        ('max_imu_gap', 1000.0),  # ms
+        ('smoothing_time', 100.0),  # ms
+    ],
+)
+def test_numbers_of_the_filter_in_other_units_are_refused(name, value):
+    with pytest.raises(InputError, match=f'parameter {name}: {value} is outside'):
+        from_mapping(PoseEkfConfig, {name: value})
+
+
 def test_parameters_of_a_class_and_of_an_instance():
     assert [name for name, _, _ in parameters(Example)] == [
         'name',
