@@ -11,7 +11,6 @@ A step of the IMU's clock looks the same, but then the stamps of the IMU have ju
 """
 
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import replace
 from statistics import median
 
@@ -101,13 +100,25 @@ class CameraClock:
         self._latest.clear()
         return first_ns
 
-    def follow(self, step_ns: int) -> Iterable[int]:
-        """Accept a step; returns the stamps of the latest poses, which were applied at wrong instants."""
+    def uncertainty_ns(self, interval_ns: float) -> int:
+        """Standard deviation [ns], at most, of the step that :meth:`proposed` has just found.
+
+        Half of what its delays are apart, or of ``interval_ns``: the median of five has half of a single one's
+        deviation, which is less than half of their range.
+        """
+        delays = [delay for _, delay in self._latest]
+        return round(0.5 * max(max(delays) - min(delays), interval_ns))
+
+    @property
+    def suspects(self) -> set[int]:
+        """Stamps of the latest poses with an unusual delay: after a step they were applied at wrong instants."""
+        return {stamp for stamp, _ in self._latest}
+
+    def follow(self, step_ns: int) -> None:
+        """Accept a step."""
         self.ahead_ns += step_ns
-        wrong = [stamp for stamp, _ in self._latest]
         self._latest.clear()
         self._imu_jump_ns = 0
-        return wrong
 
 
 class FrameGrid:

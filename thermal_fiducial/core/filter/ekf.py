@@ -1,6 +1,6 @@
 """The filter: IMU samples and camera poses in, in any order of arrival; the robot's state at every IMU sample out."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -113,16 +113,16 @@ class PoseEkf:
         off_grid_ns = self._frame_grid.off_grid(stamp_ns) if self._config.estimate_time_offset else 0
         if self._T_map_first is not None:
             pose = in_moved_map(pose, inverse(self._T_map_first))
-        pose = self._in_present_clock(pose)
+        pose, step_error_ns = self._in_present_clock(pose)
         if reason := self._unusable(pose):
             return PoseUpdate(stamp_ns, False, reason, np.nan)
-        self._history.insert(pose, off_grid_ns)
+        self._history.insert(pose, max(off_grid_ns, step_error_ns))
         self._history.take_in()
         waiting = PoseUpdate(stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
         return replace(self.decided.get(pose.stamp_ns, waiting), stamp_ns=stamp_ns)
 
-    def _unusable(self, pose: CameraPose) -> str:
-        """Why a pose cannot be used; empty if it can."""
+    def _unusable(self, pose: CameraPose, instead_of: Collection[int] = ()) -> str:
+        """Why a pose cannot be used; empty if it can. It may take the place of poses with other stamps."""
         if self._history.main is None and self._camera_clock.in_question:
             return CLOCK_JUMPED
         if not np.isfinite(pose.T_map_camera).all():
@@ -131,7 +131,7 @@ class PoseEkf:
             checked_covariance(pose.covariance, 'covariance')
         except InputError as error:
             return f'refused: {error}'
-        return self._history.untimely(pose)
+        return self._history.untimely(pose, instead_of)
 
     def move_map(self, T_new_old: FloatArray) -> None:
         """Follow a correction of the map: T_new = T_new_old @ T_old. Of an initialisation, poses in the old map go."""
@@ -142,28 +142,34 @@ class PoseEkf:
 
     # --- steps of the clocks --------------------------------------------------------------------------
 
-    def _in_present_clock(self, pose: CameraPose) -> CameraPose:
-        """``pose`` with all steps of the camera's clock taken out of its stamp, a step that it reveals included."""
-        history, pose = self._history, self._camera_clock.stamped(pose)
+    def _in_present_clock(self, pose: CameraPose) -> tuple[CameraPose, int]:
+        """``pose`` with all steps of the camera's clock taken out of its stamp, a step that it reveals included.
+
+        Also the standard deviation [ns] of a step that it reveals, 0 without one.
+        """
+        history, clock, pose = self._history, self._camera_clock, self._camera_clock.stamped(pose)
         if not history.imu:
-            return pose
-        step_ns = self._camera_clock.proposed(pose, history.imu.newest_ns, self._input.longest_ns)
+            return pose, 0
+        interval_ns = self._input.longest_ns
+        step_ns = clock.proposed(pose, history.imu.newest_ns, interval_ns)
         if not step_ns:
-            return pose
+            return pose, 0
         if abs(step_ns) < SMALLEST_STEP_NS:
             self._allow_for_step(abs(step_ns))
-            return pose
+            return pose, 0
         restamped = replace(pose, stamp_ns=pose.stamp_ns - step_ns)
-        if self._camera_clock.is_of_imu(step_ns):
+        if clock.is_of_imu(step_ns):
             # Since the step the state was propagated over time that did not pass.
-            self._camera_clock.follow(step_ns)
+            clock.follow(step_ns)
             self._begin_after_jump()
-            return restamped
+            return restamped, 0
         if not self._contradicts(pose) or not self._fits(restamped):
-            return pose
-        history.discard(self._camera_clock.follow(step_ns))
-        self._history.take_in()
-        return restamped
+            return pose, 0
+        error_ns = clock.uncertainty_ns(interval_ns) if self._config.estimate_time_offset else 0
+        history.discard(clock.suspects)
+        clock.follow(step_ns)
+        history.take_in()
+        return restamped, error_ns
 
     def _begin_after_jump(self) -> None:
         """Reset, but keep the estimated clock offset: where stamps jump, mostly samples are missing."""
@@ -196,9 +202,11 @@ class PoseEkf:
         return main.accepted_in_row == 0 and (innovation is None or innovation.nis > self._config.gate)
 
     def _fits(self, pose: CameraPose) -> bool:
-        """Whether a pose can be used, and passes the gate if the clock offset is treated as unknown."""
+        """Whether a pose can be used instead of those that suggest a step, and passes the gate of an unknown clock."""
         innovation = self._history.compared(pose)
-        return innovation is not None and is_of_unknown_clock(self._config, innovation) and not self._unusable(pose)
+        if innovation is None or self._unusable(pose, self._camera_clock.suspects):
+            return False
+        return is_of_unknown_clock(self._config, innovation)
 
     # --- output ---------------------------------------------------------------------------------------
 

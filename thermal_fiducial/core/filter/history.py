@@ -5,7 +5,7 @@ arrival. The exception is ``MotionAtPose``, which also averages the few samples 
 """
 
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 import math
 from operator import attrgetter
 
@@ -77,8 +77,8 @@ class History:
         offset = hypothesis.estimate.state.time_offset if hypothesis else first_offset
         return pose.stamp_ns + self._offset_ns + round(offset * SECOND_NS)
 
-    def untimely(self, pose: CameraPose) -> str:
-        """Why a pose with this stamp cannot be inserted; empty if it can."""
+    def untimely(self, pose: CameraPose, instead_of: Collection[int] = ()) -> str:
+        """Why a pose with this stamp cannot be inserted; empty if it can. It replaces poses with the stamps given."""
         if not self.imu:
             return 'refused: no IMU yet'
         newest_ns, due_ns = self.imu.newest_ns, self.due_ns(pose, self.main)
@@ -87,7 +87,8 @@ class History:
         oldest_ns = max(self.imu.oldest_ns, newest_ns - round(self.config.max_delay * SECOND_NS))
         if due_ns <= oldest_ns or pose.stamp_ns <= self._beliefs[0].verdict.stamp_ns:
             return 'refused: too late'
-        return 'refused: stamp repeated' if any(pose.stamp_ns == known.stamp_ns for known in self._poses) else ''
+        known = {pose.stamp_ns for pose in self._poses}.difference(instead_of)
+        return 'refused: stamp repeated' if pose.stamp_ns in known else ''
 
     def compared(self, pose: CameraPose) -> Innovation | None:
         """Innovation of a pose that is not inserted, against the estimate at its instant; None without one."""
