@@ -149,7 +149,9 @@ class ImuInput:
         if run is not None and run.first_ns <= stamp_ns <= run.last_ns:
             # Messages that come twice, or in another order, end no run.
             return Verdict.REPEATED if stamp_ns == run.last_ns else Verdict.BACKWARD
-        if run is None or not 0 < stamp_ns - run.last_ns <= self._max_gap_ns:
+        # One that was overtaken is no part of a jump ahead behind it.
+        overtaken = run is not None and run.last_ns < self._last_ns < stamp_ns
+        if run is None or overtaken or not 0 < stamp_ns - run.last_ns <= self._max_gap_ns:
             run = self._strays = StrayRun(stamp_ns, stamp_ns)
         else:
             run.last_ns, run.count = stamp_ns, run.count + 1

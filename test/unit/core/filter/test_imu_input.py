@@ -40,6 +40,15 @@ def test_a_dead_axis_is_found_within_50_ms(imu, noise, axis, value):
     assert verdicts(imu, noise(20), 200) == [Verdict.AHEAD] * 2 + [Verdict.USE] * 18
 
 
+def test_a_gap_behind_a_sample_that_was_overtaken_is_a_gap(imu, noise):
+    """The overtaken one is no part of what comes after the gap: together they were a clock that was set back."""
+    readings = noise(40)
+    assert verdicts(imu, readings[:18]) == [Verdict.USE] * 18
+    assert verdicts(imu, readings[19:20], 19) == [Verdict.USE]
+    assert verdicts(imu, readings[18:19], 18) == [Verdict.BACKWARD]
+    assert verdicts(imu, readings[20:], 80) == [Verdict.AHEAD] * 2 + [Verdict.USE] * 18
+
+
 def test_coarse_steps_repeat_themselves(imu, noise):
     """Steps of one and a half times the noise: the same value for up to 70 ms."""
     coarse = np.round(noise(4000) / 1.5)
