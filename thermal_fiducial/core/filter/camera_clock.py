@@ -24,8 +24,9 @@ SMALLEST_STEP_NS = 35_000_000
 _CHANGED_NS = 12_500_000
 #: Poses in a row that must agree on a step; poses kept for the usual delay, and the fewest for it to be known.
 _POSES, _USUAL, _ENOUGH = 5, 30, 15
-#: Largest spread [ns] of the delays of agreeing poses, beside half of the step.
-_AGREEMENT_NS = 50_000_000
+#: Largest range [ns] of the delays of agreeing poses where usual ones scatter by less, beside half of the step; a tenth
+#: of the usual ones.
+_AGREEMENT_NS, _END = 50_000_000, _USUAL // 10
 #: A stamp is off the grid of frames beyond this multiple of the largest recent distance, which is jitter, and this
 #: length [ns]. After this time [ns] the grid is lost, as errors of the period add up.
 _OFF_GRID, _OFF_GRID_NS, _LOST_NS = 3, 1_000_000, 1_000_000_000
@@ -42,6 +43,8 @@ class CameraClock:
         #: stamp of the newest sample at arrival, and delay of the pose by that sample [ns]
         self._usual: deque[tuple[int, int]] = deque(maxlen=_USUAL)
         self._latest: deque[tuple[int, int]] = deque(maxlen=_POSES)
+        #: newest sample by which a delay was measured
+        self._newest_ns = 0
         self._imu_jump_ns = 0
         self._waited = 0
 
@@ -75,9 +78,14 @@ class CameraClock:
         newest_ns : stamp of the newest IMU sample when ``pose`` arrives
         interval_ns : longest recent interval between samples; delays scatter by it, as they are measured by samples
         """
+        if newest_ns == self._newest_ns:
+            return 0  # The IMU is silent: the pose is later than that.
+        self._newest_ns = newest_ns
         late_ns = newest_ns - pose.stamp_ns
         usual_ns = median(late for _, late in self._usual) if len(self._usual) >= _ENOUGH else late_ns
         if abs(late_ns - usual_ns) < min(max(_CHANGED_NS, interval_ns), SMALLEST_STEP_NS):
+            # Those before it were no step either: delays scatter.
+            self._usual.extend((stamp + late, late) for stamp, late in self._latest)
             self._usual.append((newest_ns, late_ns))
             self._latest.clear()
             self._imu_jump_ns = 0
@@ -86,9 +94,15 @@ class CameraClock:
         self._latest.append((pose.stamp_ns, late_ns))
         delays = [delay for _, delay in self._latest]
         step_ns = round(usual_ns - median(delays))
-        if len(delays) < _POSES or max(delays) - min(delays) > min(abs(step_ns) // 2, _AGREEMENT_NS):
+        if len(delays) < _POSES or max(delays) - min(delays) > min(abs(step_ns) // 2, self._agreement_ns):
             return 0
         return step_ns
+
+    @property
+    def _agreement_ns(self) -> int:
+        """Largest range of agreeing delays [ns]: as usual ones without the tenths at either end, and not less."""
+        usual = sorted(late for _, late in self._usual)[_END:-_END]
+        return max(_AGREEMENT_NS, usual[-1] - usual[0]) if usual else _AGREEMENT_NS
 
     def take_for_usual(self) -> int:
         """Take the delay of the latest poses for the usual one; returns the stamp of the first of them."""
