@@ -1,6 +1,7 @@
 """``calibrate intrinsics``: camera_info from thermal views of a board, or from measured points."""
 
 import argparse
+import math
 from pathlib import Path
 import sys
 
@@ -18,7 +19,7 @@ from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.ranges import BOARD_MM, BOARD_POINTS, FOCAL_PX, IMAGE_PX, MORE_POINTS
 from thermal_fiducial.cli.subcommands import add_remap, file_to_write, whole_number
-from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
+from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
@@ -136,6 +137,7 @@ def _intrinsics(args: argparse.Namespace) -> int:
     write_report(args.report or args.out.with_suffix('.html'), result, views.kept, fits, error, views.unusable)
     _print_result(args.out, result, fits, views, error)
     _warn_of_focal_length(result)
+    _warn_of_principal_point(result)
     return 0
 
 
@@ -216,6 +218,20 @@ def _warn_of_focal_length(result: Calibration) -> None:
     if share > usual:
         known = f'focal length known to {100.0 * share:.2g} % only, {100.0 * usual:.2g} % is usual'
         remedy = f'tilt the board by 20 to 40 degrees, or set focal_length_std: {share:.4f}'
+        print(f'warning: {known}: {remedy}', file=sys.stderr)
+
+
+def _warn_of_principal_point(result: Calibration) -> None:
+    """Warn of a principal point that the views leave wider than the filter's default for the camera's rotation.
+
+    Corners that are all displaced alike are, to first order, those of a camera that is turned on the robot.
+    """
+    usual = PoseEkfConfig().extrinsics_orientation_std
+    point = max(sigma for name, _, sigma in result.parameter_rows() if name in ('cx', 'cy'))
+    turn = point / result.camera.focal_px
+    if turn > usual:
+        known = f'principal point known to {point:.2g} px only, which may turn the camera by {1e3 * turn:.2g} mrad'
+        remedy = f'more views, or set extrinsics_orientation_std: {math.hypot(turn, usual):.4f}'
         print(f'warning: {known}: {remedy}', file=sys.stderr)
 
 

@@ -215,8 +215,22 @@ def test_unreadable_pictures_and_those_of_another_size_are_named(tmp_path, capsy
 @pytest.mark.parametrize(('tilt_deg', 'warns'), [(6.0, True), (35.0, False)])
 def test_a_focal_length_that_flat_views_leave_open_is_named(tmp_path, capsys, tilt_deg, warns):
     """The mapper takes 0.2 % where nothing else is said; twelve views tilted by up to 6 degrees leave 1.2 %."""
+    assert ('focal_length_std: 0.' in _calibrated(tmp_path, capsys, tilt_deg)) == warns
+
+
+@pytest.mark.parametrize(('shrunk', 'warns'), [(1, False), (4, True)])
+def test_a_principal_point_that_may_turn_the_camera_is_named(tmp_path, capsys, shrunk, warns):
+    """Twelve views leave 0.8 px: 1.1 mrad at 760 px of focal length, 4 at 190 px. The filter takes 2 mrad."""
+    err = _calibrated(tmp_path, capsys, 35.0, shrunk)
+    assert ('extrinsics_orientation_std: 0.0' in err) == warns
+
+
+def _calibrated(tmp_path, capsys, tilt_deg, shrunk=1):
+    """Warnings of a calibration from twelve views of a board, tilted by up to an angle, by a camera of 640x512."""
     rng = np.random.default_rng(1)
     K = np.array([[760.0, 0.0, 319.5], [0.0, 760.0, 255.5], [0.0, 0.0, 1.0]])
+    K[:2] /= shrunk
+    width, height = 640 // shrunk, 512 // shrunk
     board = np.array([(0.05 * x, 0.05 * y, 0.0) for y in range(6) for x in range(8)])
     lines = ['view,point,u,v,x,y']
     for view in range(12):
@@ -224,10 +238,10 @@ def test_a_focal_length_that_flat_views_leave_open_is_named(tmp_path, capsys, ti
         place = np.array([rng.uniform(-0.3, -0.05), rng.uniform(-0.25, 0.0), rng.uniform(0.75, 1.1)])
         pixels = cv2.projectPoints(board, turn, place, K, None)[0][:, 0] + rng.normal(0.0, 0.05, (len(board), 2))
         for point, ((u, v), (x, y, _)) in enumerate(zip(pixels, board, strict=True)):
-            if 0.0 < u < 639.0 and 0.0 < v < 511.0:
+            if 0.0 < u < width - 1 and 0.0 < v < height - 1:
                 lines.append(f'{view},{point},{u:.4f},{v:.4f},{x:.4f},{y:.4f}')
     points = tmp_path / 'points.csv'
     points.write_text('\n'.join(lines))
-    words = ['calibrate', 'intrinsics', str(points), '--size', '640', '512', '--models', 'plumb_bob']
+    words = ['calibrate', 'intrinsics', str(points), '--size', str(width), str(height), '--models', 'plumb_bob']
     assert main([*words, '--out', str(tmp_path / 'lens.yaml')]) == 0
-    assert ('focal_length_std: 0.' in capsys.readouterr().err) == warns
+    return capsys.readouterr().err
