@@ -52,6 +52,15 @@ def test_a_saved_map_is_loaded_as_it_was(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ['map.yaml']
 
 
+def test_a_map_of_the_largest_dictionary_is_saved_with_all_fields(tmp_path):
+    """2,115 markers of tagStandard41h12; what cannot be read back is not written, and a flown map would be lost."""
+    flown = {
+        key: MapMarker(key, 0.3, False, np.eye(4), 1e-4 * np.eye(6), observations=3, first_seen_ns=1, last_seen_ns=2)
+        for key in range(2115)
+    }
+    save_map(tmp_path / 'map.yaml', MarkerMap(flown))
+
+
 def test_what_is_left_out_has_defaults(tmp_path):
     path = tmp_path / 'map.yaml'
     path.write_text(
