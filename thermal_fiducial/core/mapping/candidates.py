@@ -87,7 +87,7 @@ class Candidate:
         if not fits.chi2[0] <= INCONSISTENT * len(self.views):
             if len(self.views) >= 2 * MIN_VIEWS:
                 self._drop_farthest()
-            return f'marker {self.id}: its views contradict each other'
+            return f'marker {self.id}: its views contradict each other; is its side {self.size:g} m?'
         scale = noise_factor(float(fits.chi2[0]), 8 * len(self.views) - 6)
         others = np.flatnonzero(rotation_angle(fits.T[0, :3, :3].T @ fits.T[:, :3, :3]) > SAME_POSE)
         if len(others) and fits.cost[others[0]] - fits.cost[0] < UNAMBIGUOUS * scale:

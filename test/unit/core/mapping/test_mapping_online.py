@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 from support.scenes import motion_prior
-from support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
+from support.walls import CAMERA, flight, look, rows as rows_of, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import covariance_of
@@ -15,7 +15,7 @@ from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import CONTRADICTED, MarkerMapper
-from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.measurements import corners_px, Odometry
 from thermal_fiducial.map_tools.map_editing import transformed
 
 # The body is the camera: odometry and camera pose are one.
@@ -317,6 +317,20 @@ def test_a_candidate_that_moves_never_enters():
         result = m.process(stamp(k), see(flight(k / 30), scene, 0.05, rng), CAMERA)
     assert 50 not in m.map.markers
     assert 50 in result.candidates
+
+
+def test_a_marker_of_another_size_never_enters_beside_known_ones_and_its_side_is_asked_for():
+    """Of 0.2 m, without an entry in marker_size_overrides: its range is half as large again as it should be."""
+    rng = np.random.default_rng(6)
+    poses = wall(rng)
+    m = from_one_marker(poses)
+    for k in range(0, 180, 3):
+        known = see(flight(k / 30), {i: poses[i] for i in (0, 1)}, 0.05, rng)
+        small = see(flight(k / 30), {6: poses[6]}, 0.05, rng, size=0.2)
+        as_usual = rows_of(small['id'], corners_px(small), 0.05)
+        result = m.process(stamp(k), np.concatenate([known, as_usual]), CAMERA)
+    assert 6 not in m.map.markers
+    assert result.candidates[6] == 'marker 6: its views contradict each other; is its side 0.3 m?'
 
 
 def test_a_map_of_a_thousand_costs_a_frame_no_more():
