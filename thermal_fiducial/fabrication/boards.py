@@ -12,6 +12,8 @@ from thermal_fiducial.fabrication.shape import contour, Rectangle, trace
 
 #: Most circles of a board: more would be too small for any camera, and fill the memory.
 _MOST_CIRCLES = 10_000
+#: Acrylic between circles and mounting holes, as ``--min-web`` asks of markers.
+_WEB_MM = 3.0
 
 
 def asymmetric_circles(columns: int, rows: int, spacing: float) -> FloatArray:
@@ -38,7 +40,9 @@ def circle_board(columns: int, rows: int, spacing: float, diameter: float, optio
         raise InputError('a circle grid needs 2 x 2 circles or more, and a millimetre of acrylic between them')
     if columns * rows > _MOST_CIRCLES:
         raise InputError(f'a circle grid of {columns} x {rows}: {_MOST_CIRCLES} circles at most')
-    margin = 2.0 * spacing
+    # Small circles must not run into the mounting holes in the corners.
+    apart = 0.5 * (diameter + options.hole_diameter) + _WEB_MM
+    margin = max(2.0 * spacing, _hole_inset(options) + apart / np.sqrt(2.0))
     centres = asymmetric_circles(columns, rows, spacing)
     width, height = centres.max(axis=0) + 2.0 * margin
     circles = [Circle(margin + x, height - margin - y, 0.5 * (diameter - options.kerf)) for x, y in centres.tolist()]
@@ -96,7 +100,12 @@ def _outline(width: float, height: float, options: PlateOptions) -> tuple[Contou
     return (contour(corners, options.kerf, 0.0),)
 
 
+def _hole_inset(options: PlateOptions) -> float:
+    """Distance of the centres of mounting holes from both edges."""
+    return 1.5 * options.hole_diameter
+
+
 def _corner_holes(width: float, height: float, options: PlateOptions) -> list[Circle]:
-    inset = 1.5 * options.hole_diameter
+    inset = _hole_inset(options)
     radius = 0.5 * (options.hole_diameter - options.kerf)
     return [Circle(x, y, radius) for x in (inset, width - inset) for y in (inset, height - inset)]

@@ -331,6 +331,18 @@ def test_circle_board_reads_as_a_grid(tmp_path):
     assert len(centres) == 44
 
 
+def test_small_circles_of_a_board_keep_away_from_its_mounting_holes():
+    for spacing, diameter in ((5.0, 6.0), (5.0, 5.0), (25.0, 20.0)):
+        drawing = circle_board(4, 5, spacing, diameter, PlateOptions())
+        webs = [
+            np.hypot(hole.x - dot.x, hole.y - dot.y) - hole.radius - dot.radius
+            for hole in drawing.holes
+            for dot in drawing.dots
+        ]
+        # Three millimetres, as between the holes of a marker; of 6 mm, 5 mm apart in rows, holes and circles were one.
+        assert min(webs) > 3.0
+
+
 def square(x, y, side, *, hole=False):
     points = np.array([[x, y], [x + side, y], [x + side, y + side], [x, y + side]], dtype=float)
     return Contour(points[::-1] if hole else points, np.zeros(4))
