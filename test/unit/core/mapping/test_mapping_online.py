@@ -6,7 +6,8 @@ import time
 import numpy as np
 import pytest
 from support.scenes import motion_prior
-from support.walls import CAMERA, flight, look, rows as rows_of, see, SIZE, stamp, wall
+from support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
+from support.walls import rows as rows_of
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import covariance_of
