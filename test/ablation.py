@@ -178,8 +178,8 @@ def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
 _READOUT = tuple(f'prediction.frame:{name}' for name in ('delays', 'stretch', 'displacement', 'rolling_displacement'))
 _SCALES = _place('finding.search:SearchScales')
 _ALL_IN_THE_SEARCH = {'finding.finder:_next_scales': lambda *_, **__: _SCALES.ALL}
-_DISPLAYED = 'confirmation:DisplayedSides', 'confirmation:_lag_across', 'confirmation:_corners_by_pairs'
-_BORDER_WIDTH = {'confirmation:DisplayedSides.corrected': lambda _, __, refined, ___: refined.corners}
+_EVEN = {'corners.pattern_residuals:_beyond': lambda amounts, noise, _: np.zeros_like(noise)}
+_UNEVEN = 'corners.pattern_residuals:Unevenness', 'corners.pattern_residuals:_beyond'
 
 MECHANISMS = {
     'corners of squares': Mechanism(
@@ -192,7 +192,7 @@ MECHANISMS = {
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
     'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'prediction.frame:_HARDLY_PX': np.inf}),
     'whole patterns in motion blur': Mechanism(
-        'fast, 8 K, guided', (), {'corners.refining:are_fitted_whole': _by_optics_alone}
+        'fast, 8 K, guided', (), {'corners.refining:too_blurred_for_sides': _by_optics_alone}
     ),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(
@@ -201,9 +201,8 @@ MECHANISMS = {
     'partially visible markers': Mechanism(
         'landing', ('partial.partial_markers', 'partial.visible_cells', 'partial.grid'), {'detector:_ENOUGH_WHOLE': 0}
     ),
-    'width of borders, slow': Mechanism('8 bits, slow', _DISPLAYED, _BORDER_WIDTH),
-    'width of borders, fast': Mechanism('8 bits, fast', _DISPLAYED, _BORDER_WIDTH),
-    'width of borders, carpet': Mechanism('carpet', _DISPLAYED, _BORDER_WIDTH),
+    'uneven levels, slow': Mechanism('8 bits, slow', _UNEVEN, _EVEN),
+    'uneven levels, carpet': Mechanism('carpet', _UNEVEN, _EVEN),
     'polarity': Mechanism('slow, 8 K, blind', ('finding.finder:FrameHistory.polarities',), {}, {'polarity': 'any'}),
     'half resolution': Mechanism(
         'slow, 0.5 K, blind', (), {'finding.finder:_next_scales': lambda *_, **__: _SCALES.FINE}

@@ -40,9 +40,7 @@ class Stacked:
 
     def with_others(self, which: IntArray, others: Self) -> Self:
         """The batch with its items at ``which`` replaced by ``others``."""
-        order = np.arange(len(self._fields()[0]))
-        order[which] = len(order) + np.arange(len(which))
-        return self.joined(others).only(order)
+        return self._of(_with(a, which, b) for a, b in zip(self._fields(), others._fields(), strict=True))
 
     def _fields(self) -> list[Any]:
         names: tuple[str, ...] = self.__slots__
@@ -51,6 +49,16 @@ class Stacked:
     def _of(self, fields: Iterable[Any]) -> Self:
         make: Callable[..., Self] = type(self)
         return make(*fields)
+
+
+def _with(field: Any, which: IntArray, others: Any) -> Any:
+    if isinstance(field, Stacked):
+        return field.with_others(which, others)
+    if not isinstance(field, np.ndarray):
+        return field
+    changed = field.copy()
+    changed[which] = others
+    return changed
 
 
 def _at(field: Any, keep: BoolArray | IntArray) -> Any:

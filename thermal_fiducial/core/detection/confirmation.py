@@ -1,11 +1,7 @@
-"""Confirms markers at their refined corners, and corrects corners in pictures for a display.
+"""Confirms markers at their refined corners.
 
-A marker is confirmed by the correlation of its pattern. A gain control for displays is a nonlinear function of the
-counts. The middle between the gray levels of black and white is then not the middle of the blurred step between them:
-all dark regions grow, or all shrink, and along the motion of a marker more than across it. The sides of a marker and
-the inner edges of its border move in opposite directions, so the width of the border measures the displacement. Markers
-that are not large there are refined by fitting the whole pattern, which needs no correction. Those whose cells are
-hardly wider than the blur are confirmed by the evidence of that fit or by their pattern like the others.
+A marker is confirmed by the correlation of its pattern. Those whose cells are hardly wider than the blur are confirmed
+by the evidence of the fit of their pattern, or like the others.
 """
 
 from dataclasses import replace
@@ -14,28 +10,17 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corners.corner_errors import (
-    BLURRED_OUT,
-    OF_BENT_BLUR_PX,
-    OF_BENT_LAG,
-    OF_BENT_SCALE_PX,
-    OF_BORDER_LAG,
-    OF_BORDER_PX,
-    OF_BORDERS_TOGETHER,
-    OF_LOCAL_PX,
-)
+from thermal_fiducial.core.detection.corners.corner_errors import BLURRED_OUT, OF_LOCAL_PX
 from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.corners.refining import RefinedMarkers
-from thermal_fiducial.core.detection.corners.segments import measure, REACHED, Segments, UNMEASURED
-from thermal_fiducial.core.detection.corners.sides import blur_of, free_distance, model, sides_of, white_behind_border
 from thermal_fiducial.core.detection.finding.quads import halfway, halved
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
-from thermal_fiducial.core.detection.prediction.frame import counts_of, Frame, MotionBlur
+from thermal_fiducial.core.detection.prediction.frame import Frame
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import planar_poses
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
 # Cells at least this wide are decoded at half resolution, with half the noise and less blur [px].
 _WIDE_CELL_PX = 8.0
@@ -67,10 +52,6 @@ _WINDOW_IN_CELLS, _LARGEST_WINDOW = 0.3, 5
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
 # Largest step of ``cornerSubPix`` that is accepted [cells].
 _LOST_CELLS = 0.4
-# Factor on the covariances of four corners with a common error: taken as independent, their mean has a quarter of it.
-_CORNERS = 4.0
-# Columns of pixels in a segment of a border, and the blur for which they are long enough [px].
-_COLUMNS, _WIDEST_PX = 6, 2.0
 
 
 def local_corners(image: Float32Array, refined: RefinedCorners, cells: int) -> RefinedCorners:
@@ -89,82 +70,11 @@ def local_corners(image: Float32Array, refined: RefinedCorners, cells: int) -> R
     return replace(refined, corners_px=corners, covariances=refined.covariances + OF_LOCAL_PX**2 * np.eye(2))
 
 
-class DisplayedSides:
-    """Corrects corners for the displacement of sides in pictures for a display; markers with ``bits`` (M, n, n)."""
-
-    def __init__(self, bits: Gray) -> None:
-        self._white = white_behind_border(bits)
-        self._bits = bits.shape[1]
-
-    def corrected(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> RefinedCorners:
-        """Corrected corners of N markers at the stamp; covariances with the remaining error of the correction."""
-        if len(refined.ids) == 0:
-            return refined.corners
-        segments = self._across_border(frame, refined, blur_px)
-        normals = _normals(refined.corners.corners_px)
-        lag_px = _lag_across(normals, refined.blur)
-        by_pair = (len(lag_px), 2, -1)
-        shift, variance = segments.shift.reshape(by_pair), segments.variance.reshape(by_pair)
-        of_border = OF_BORDER_PX**2 + (OF_BORDER_LAG * lag_px[..., None]) ** 2
-        weight = np.where(variance < UNMEASURED, 1.0 / (OF_BORDERS_TOGETHER * (variance + of_border)), 0.0)
-        # Sides displaced outward by 1 scale the pattern, so that the inner edges appear displaced inward by ``gain``.
-        gain = 2.0 - 2.0 / (self._bits + 2.0)
-        information = gain * gain * weight.sum(axis=2)
-        # At rest all sides are displaced alike. In motion white gives way to black more slowly, or faster, than black
-        # to white: what that displaces opposite sides by, both outward or both inward, the other two do not have.
-        prior = OF_BENT_SCALE_PX**2 + (OF_BENT_LAG * lag_px[..., None]) ** 2 * np.eye(2)
-        covariance = np.linalg.solve(np.eye(2) + prior * information[:, None], prior)
-        displacement = covariance @ (gain * (weight * shift).sum(axis=2))[..., None]
-        by_pairs = _corners_by_pairs(normals)
-        corners = refined.corners.corners_px - (by_pairs @ displacement[:, None])[..., 0]
-        unknown = _CORNERS * by_pairs @ covariance[:, None] @ by_pairs.swapaxes(-1, -2)
-        unknown = unknown + OF_BENT_BLUR_PX**2 * np.eye(2)
-        return replace(refined.corners, corners_px=corners, covariances=refined.corners.covariances + unknown)
-
-    def _across_border(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> Segments:
-        """Inward displacements of the inner edges of the borders, where the cells behind are white."""
-        at = ImagePoints.at(refined.observed.corners_px, frame.camera)
-        inset = 1.0 / (self._bits + 2.0)
-        a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
-        inner = np.moveaxis(se3.seen_between(at.x, se3.bilinear(a, b)), 0, -1)
-        sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _WIDEST_PX)
-        blur = blur_of(sides, blur_px, refined.blur.spread)
-        free = free_distance(sides, blur.across)
-        modelled = model(sides, blur, free, free)
-        counting = modelled.counting & self._white[refined.ids].reshape(-1, self._bits)
-        counts = counts_of(sides.pixel, frame.image, refined.blur.to_tails)
-        return measure(counts, modelled._replace(counting=counting), REACHED * blur.across)
-
-
-def _normals(corners: FloatArray) -> FloatArray:
-    """Outward unit normals (N, 4, 2) of the sides that begin at the corners (N, 4, 2) of quadrilaterals."""
-    side = np.roll(corners, -1, axis=1) - corners
-    side = side / np.linalg.norm(side, axis=-1, keepdims=True)
-    return np.stack([side[..., 1], -side[..., 0]], axis=-1)
-
-
-def _lag_across(normals: FloatArray, blur: MotionBlur) -> FloatArray:
-    """Motion blur (N, 2) of two pairs of opposite sides with ``normals`` (N, 4, 2), across them [px]."""
-    across = np.abs(normals @ (blur.shift + blur.removed).mean(axis=1)[..., None])[..., 0]
-    return np.asarray(0.5 * (across[:, :2] + across[:, 2:]))
-
-
-def _corners_by_pairs(normals: FloatArray) -> FloatArray:
-    """Derivatives (N, 4, 2, 2) of corners by how far outward the two pairs of opposite sides are displaced."""
-    before = np.roll(normals, 1, axis=1)
-    cosine = np.sum(normals * before, axis=-1, keepdims=True)
-    by_next, by_last = normals - cosine * before, before - cosine * normals
-    even = (np.arange(4) % 2 == 0)[:, None]
-    pairs = np.stack([np.where(even, by_next, by_last), np.where(even, by_last, by_next)], axis=-1)
-    return np.asarray(pairs / (1.0 - cosine * cosine)[..., None])
-
-
 def confirmed(
     frame: Frame,
     found: FoundMarkers,
     markers: RefinedMarkers,
     decoder: Decoder,
-    displayed: DisplayedSides,
     config: ArucoDetectorConfig,
 ) -> RefinedMarkers:
     """The markers ``found`` that are confirmed at their refined corners, with the corners to publish."""
@@ -174,10 +84,6 @@ def confirmed(
     markers = markers if keep.all() else markers.only(keep)
     if config.refinement == 'subpix':
         return replace(markers, corners=local_corners(frame.image, markers.corners, decoder.cells))
-    sides = np.flatnonzero(~markers.observed.by_pattern)
-    if frame.displayed and len(sides):
-        corrected = displayed.corrected(frame, markers.only(sides), config.blur_px)
-        return replace(markers, corners=markers.corners.with_others(sides, corrected))
     return markers
 
 

@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
-from thermal_fiducial.core.detection.confirmation import confirmed, DisplayedSides
+from thermal_fiducial.core.detection.confirmation import confirmed
 from thermal_fiducial.core.detection.corners.refining import refine
 from thermal_fiducial.core.detection.finding.finder import FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.partial.partial_markers import PartialMarkerSearch
@@ -43,7 +43,6 @@ class MarkerDetector:
         overrides = size_overrides(config.marker_size_overrides)
         self._sizes = np.array([overrides.get(key, config.marker_size) for key in range(decoder.count)])
         self._finder = MarkerFinder(decoder)
-        self._displayed = DisplayedSides(bits)
         self._partial = PartialMarkerSearch(decoder, bits)
         self._known = KnownMarkers({}, self._sizes)
         self._mount(config)
@@ -93,7 +92,7 @@ class MarkerDetector:
             expected = known.expected(T_camera_map, camera, config.min_side_px)
         found, history = self._finder.find(frame, history, known, expected, config)
         refined = refine(frame, found, history.track, self._decoder, config)
-        refined = confirmed(frame, found, refined, self._decoder, self._displayed, config)
+        refined = confirmed(frame, found, refined, self._decoder, config)
         ids, corners = refined.ids, refined.corners
         at = refined.places.at.at_pixels(corners.corners_px)
         poses = self._poses(ids, corners.covariances, at, T_camera_map)

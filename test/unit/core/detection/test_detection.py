@@ -1,14 +1,11 @@
 """The detector on rendered frames."""
 
-from types import SimpleNamespace
-
 import cv2
 import numpy as np
 import pytest
 from support.scenes import camera_of
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.confirmation import DisplayedSides
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, MARKER_DTYPE
@@ -87,12 +84,12 @@ def last_rows(frames, process, scenario='wall'):
 
 
 @pytest.mark.parametrize('bent', [0.5, 2.0])
-def test_what_a_display_displaces_the_border_shows(frames, bent):
+def test_what_a_display_displaces_the_pattern_shows(frames, bent):
     rows = last_rows(frames, lambda counts: displayed(counts, bent))
     truth = np.stack([frames[-1].corners_px[marker_id] for marker_id in rows['id'].tolist()])
     error = corners_px(rows) - truth
     # A bent scale moves the middle of black and white, and with it all sides alike: by -0.34 px and +0.54 px as long as
-    # nothing takes that out, by 0.001 and -0.012 px then.
+    # nothing takes that out, by 0.009 and -0.004 px then.
     outward = np.sum(error * np.sign(truth - truth.mean(axis=1, keepdims=True)), axis=-1).mean()
     assert abs(outward) < 0.04
     nees = np.einsum('nki,nkij,nkj->nk', error, np.linalg.inv(corner_covariances(rows)), error).mean()
@@ -100,28 +97,23 @@ def test_what_a_display_displaces_the_border_shows(frames, bent):
     assert nees < 2.0
 
 
-@pytest.mark.parametrize(('bent', 'allowed'), [(0.35, 0.04), (3.0, 0.13)])
+@pytest.mark.parametrize(('bent', 'allowed'), [(0.35, 0.03), (3.0, 0.08)])
 def test_what_a_display_does_to_motion_blur_patterns_show(bent, allowed):
     """In 2 px of it, black takes longer to give way to white than white to black, or the other way round."""
     frames = list(render_frames('fast', seconds=20.0, seed=5, start=440, stop=444))
     rows = last_rows(frames, lambda counts: displayed(counts, bent), 'fast')
     error = corners_px(rows) - np.stack([frames[-1].corners_px[marker_id] for marker_id in rows['id'].tolist()])
     shape = error - error.mean(axis=1, keepdims=True)
-    # 0.026 and 0.105 px when this was written; by the width of borders 0.043 and 0.103, by one width 0.069 and 0.158.
+    # 0.020 and 0.064 px when this was written; without the lag tails, taken from gray levels, 0.026 and 0.105, by the
+    # width of borders 0.043 and 0.103.
     assert np.sqrt(np.mean(shape**2)) < allowed
-
-
-def test_without_markers_a_display_displaces_nothing():
-    untouched = SimpleNamespace(ids=np.zeros(0, dtype=np.int64), corners='untouched')
-    bits = load_dictionary('DICT_4X4_50').bits
-    assert DisplayedSides(bits).corrected(None, untouched, 0.66) == 'untouched'
 
 
 def test_raw_counts_are_claimed_better_than_a_display(frames):
     raw = last_rows(frames, lambda counts: counts)
     bent = last_rows(frames, lambda counts: displayed(counts, 2.0))
-    # Measured: 0.016 and 0.13 px.
-    assert np.median(raw['sigma_px']) < 0.05 < 0.1 < np.median(bent['sigma_px'])
+    # Measured: 0.016 and 0.057 px.
+    assert np.median(raw['sigma_px']) < 0.03 < 0.05 < np.median(bent['sigma_px'])
 
 
 @pytest.mark.parametrize(('height', 'found'), [(120, [3]), (150, []), (90, []), (60, [])])

@@ -20,20 +20,10 @@ OF_PATTERN_PX = 0.006
 #: A corner by the whole pattern in a picture for a display [px]: gray levels there are a nonlinear function of the
 #: counts, and sheets are bent. Photos of a room and of a carpet, against the same at full resolution.
 OF_DISPLAYED_PATTERN_PX = 0.05
-#: A side in a picture for a display, a nonlinear function of the counts [px]: if its middle gray lies anywhere between
-#: a fifth and four fifths of the original step, a step blurred by 0.66 px is displaced by up to 0.55, evenly spread.
+#: A side of a partially visible marker in a picture for a display, a nonlinear function of the counts [px]: if its
+#: middle gray lies anywhere between a fifth and four fifths of the original step, a step blurred by 0.66 px is
+#: displaced by up to 0.55, evenly spread.
 OF_BENT_SCALE_PX = 0.3
-#: Two opposite sides there by the lag, along the motion, as a share of the motion blur: where white has decayed to that
-#: gray by -log f of the time constant, black has risen to it after -log(1 - f), and half of the difference is 0.38 rms.
-OF_BENT_LAG = 0.4
-#: A corner there, after the correction by the width of the border [px]: motion blur is distorted too.
-OF_BENT_BLUR_PX = 0.1
-#: A segment of a border there, and how much larger the variance of their mean is than if segments erred by themselves:
-#: of rendered frames after the Tau 2's plateau equalisation, errors of the displacement found are 3 to 4 of the sigmas
-#: that independent segments would have, of markers of 14 to 60 px seen at up to 70 degrees.
-OF_BORDER_PX, OF_BORDERS_TOGETHER = 0.05, 12.0
-#: The same as a share of the motion blur: without it, borders in 4 to 8 px of blur were off by 7 of their sigmas.
-OF_BORDER_LAG = 0.05
 #: Corners of a marker whose contrast is uneven, by smoke before it or by what it hangs in front of [px over the share
 #: by which the contrast changes from cell to cell]. A blurred step whose contrast has a slope, fitted without one in
 #: pixels up to a cell away, is displaced by 0.7 of what the contrast changes in a cell; a slope of the level displaces
@@ -48,6 +38,9 @@ SURFACE_FALLS = 0.1
 #: smoke before it. Behind smoke that hides 0.6 of the warmth and changes by a third of that within 20 px, any larger
 #: value leaves the same errors of clear markers, and faint ones pay for it without smoke.
 LEVEL_BENDS = 0.03
+#: Standard deviation of the amounts that bend the gray scale of a picture for a display, as shares of the contrast: by
+#: a quadratic of 1, the scale begins or ends with a slope of 0.
+GRAY_BENDS = 1.0
 #: A side by a gradient of the contrast across it [px^2]: a step with a slope on one side, fitted as a step blurred by
 #: 0.75 px in pixels up to four blurs away, is displaced by 1.4 to 2.0 px^2 times the slope over the step. The slope
 #: looks like contrast too [px]: a step of nothing has 2 px of the slope. Both grow with the distance of the pixels.
@@ -56,10 +49,9 @@ OF_GRADIENT_PX2, GRADIENT_AS_CONTRAST_PX = 2.0, 2.0
 #: the motion blur. Rendered frames of a lag in steps, and of one of 14 ms taken for 10: corners with 2 to 8 px of blur
 #: are displaced by 0.010 to 0.014 of it, along the motion and across.
 OF_LAG, OF_LAG_FORM = 0.35, 0.014
-#: The latter in pictures for a display, where it is no exponential of the gray levels: after a Tau 2's plateau
-#: equalisation, markers of 25 to 40 px with 0.5 to 2 px of blur are fitted with 0.05 to 0.07 of it, 0.015 where the
-#: scale is linear.
-OF_DISPLAYED_LAG_FORM = 0.06
+#: The latter in pictures for a display: after a Tau 2's plateau equalisation, patterns of 16 to 50 px in 1 to 4 px of
+#: blur are off by 0.02 to 0.04 of it, where time constants are up to a fifth off.
+OF_DISPLAYED_LAG_FORM = 0.03
 #: Displacement of a corner by motion blur that is not modelled [px], over the residuals that it leaves [contrasts], and
 #: the residuals beyond which they hardly grow with it. Measured: 0.015 at rest, 0.05 at 1.5 px of blur, 0.08 at 6 px.
 BLUR_THAT_SHOWS, BLURRED_OUT = 20.0, 0.055

@@ -9,6 +9,7 @@ r with a probability of the order of r^(v/2), where v is the number of independe
 most one a bit: -v/2 log r is the log-likelihood ratio of the marker over such a square.
 """
 
+from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -16,22 +17,24 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.corners.blurred_patterns import (
+    BENDS,
     BLUR,
+    cell_weights,
     CORNERS,
-    linearised,
+    LINEAR,
     pattern_grid,
-    PatternResiduals,
     PatternView,
-    UNEVEN,
-    UNEVEN_AMOUNTS,
-    UNEVEN_AT_CORNERS,
+    SMALL,
+    SMALL_AT_CORNERS,
 )
 from thermal_fiducial.core.detection.corners.corner_errors import (
+    GRAY_BENDS,
     LEVEL_BENDS,
     OF_DISPLAYED_PATTERN_PX,
     OF_PATTERN_PX,
     SURFACE_FALLS,
 )
+from thermal_fiducial.core.detection.corners.pattern_residuals import linearised, PatternResiduals
 from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.detection.patterns import Decoder
@@ -49,12 +52,10 @@ _NARROW = 6.0
 # The same in blurs of optics and motion together: at 6 a fast frame takes a third longer, and a wrong time constant of
 # the bolometers displaces corners more.
 _NARROW_IN_MOTION = 4.5
-# The same in pictures for a display, where only the whole pattern shows what gain control makes of its edges. Behind
-# smoke, fits of patterns with cells of 13 to 17 blurs are worse than those of sides, whose contrast is local.
-_NARROW_ON_DISPLAYS = 11.0
-# Distance of samples [px]: 0.85 px gives no better corners; and least number of them along a cell, and largest in
-# pictures for a display. With four, cells of 8 px there are not always found; with six, corners are no better.
-_APART_PX, _FEWEST, _MOST = 1.0, 3, 5
+# Distance of samples [px]: 0.85 px gives no better corners; least and largest number of them along a cell. Where cells
+# are wider, they are near the lines between cells, at about this distance [blurs].
+_APART_PX, _FEWEST, _MOST = 1.0, 3, 6
+_APART = 1.3
 # Steps of a fit, and length of the step of a corner after which there is no further one [px]. Size and focus converge
 # slowly together: 0.03 px would leave 0.2 per mille more of the size of 22 px.
 _STEPS, _CONVERGED_PX = 8, 0.02
@@ -74,8 +75,10 @@ _LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.3, (0.5, 2.0)
 # Standard deviation of the blur, in blurs of the optics: the focus. That of the corners from where they are looked for
 # [cells].
 _FOCUS, _START = 0.3, 0.5
-# Standard deviations of what is uneven by little, at the corners, as shares of the contrast.
-_UNEVEN_STD = np.array([SURFACE_FALLS, LEVEL_BENDS, LEVEL_BENDS, LEVEL_BENDS])
+# Standard deviations of amounts that are small, as shares of the contrast.
+_SMALL_STD = np.concatenate(
+    [np.array([SURFACE_FALLS, LEVEL_BENDS, LEVEL_BENDS, LEVEL_BENDS]) / SMALL_AT_CORNERS, np.full(BENDS, GRAY_BENDS)]
+)
 # Parameters of a fit: corners, blur, contrast, warm surface, level, background. A fit to something that is not there
 # makes use of fewer, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 it
 # is higher below 8.
@@ -106,7 +109,7 @@ class _Prior(NamedTuple):
         """
         precision, off = self._precision(at), np.zeros(at.J.shape[:2])
         off[:, CORNERS] = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
-        off[:, BLUR], off[:, UNEVEN_AMOUNTS] = at.blur - self.blur_px, at.amounts[:, UNEVEN]
+        off[:, BLUR], off[:, LINEAR][:, SMALL] = at.blur - self.blur_px, at.amounts[:, SMALL]
         information = by_samples.copy()
         np.einsum('qii->qi', information)[:] += precision
         return _solvable(information), _gradient(at) + (precision * off)[..., None]
@@ -117,7 +120,8 @@ class _Prior(NamedTuple):
         precision[:, CORNERS] = 1.0 / self.corners_std[:, None] ** 2
         precision[:, BLUR] = 1.0 / (_FOCUS * self.blur_px) ** 2
         of_contrast = 1.0 / (at.contrast * at.contrast + TINY)
-        precision[:, UNEVEN_AMOUNTS] = (UNEVEN_AT_CORNERS / _UNEVEN_STD) ** 2 * of_contrast[:, None]
+        small = at.amounts[:, SMALL].shape[1]
+        precision[:, LINEAR][:, SMALL] = (1.0 / _SMALL_STD[:small]) ** 2 * of_contrast[:, None]
         return precision * _variance_of_samples(at, self.blur_px)[:, None]
 
 
@@ -144,17 +148,16 @@ def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> B
     return np.asarray(widths(corners_px) < _NARROW * blur_px * cells)
 
 
-def are_fitted_whole(
-    corners_px: FloatArray, cells: int, blur_px: float, motion: MotionBlur, *, displayed: bool
-) -> BoolArray:
-    """Which markers (N, 4, 2) are refined by their whole patterns: small or blurred ones, and larger ones on displays.
+def too_blurred_for_sides(corners_px: FloatArray, cells: int, blur_px: float, motion: MotionBlur) -> BoolArray:
+    """Which markers (N, 4, 2) have sides that are not measured by themselves, for their size or for motion blur."""
+    blurs_px = np.hypot(blur_px, np.hypot(*motion.spread.T))
+    return np.asarray(widths(corners_px) < np.maximum(_NARROW * blur_px, _NARROW_IN_MOTION * blurs_px) * cells)
 
-    There lag tails count as blur as well: edges of a pattern that lag behind show together what gain control makes of
-    them.
-    """
-    limit, of_motion = (_NARROW_ON_DISPLAYS, motion.lag) if displayed else (_NARROW_IN_MOTION, motion.spread)
-    blurs_px = np.hypot(blur_px, np.hypot(*of_motion.T))
-    return np.asarray(widths(corners_px) < np.maximum(_NARROW * blur_px, limit * blurs_px) * cells)
+
+def nearness(corners_px: FloatArray, cells: int, blurs_px: FloatArray) -> IntArray:
+    """How many times markers (N, 4, 2) are sampled twice as near the lines between cells, by their blurs (N,) [px]."""
+    apart = sides_px(corners_px) / (cells * _MOST) / (_APART * blurs_px)
+    return np.maximum(np.rint(np.log2(np.maximum(apart, 1.0))), 0.0).astype(np.int64)
 
 
 def fitted_patterns(
@@ -162,6 +165,7 @@ def fitted_patterns(
     found: FoundMarkers,
     start: ImagePoints,
     view: PatternView,
+    nearer: int,
     decoder: Decoder,
     blur_px: float,
 ) -> RefinedCorners:
@@ -171,10 +175,11 @@ def fitted_patterns(
     ----------
     found : (N,)
     start : (N, 4) corners in the image, accurate to half a cell
-    view : the image without lag tails
+    view : the image; of raw counts, without lag tails
+    nearer : of :func:`nearness`, the same for all
     blur_px : standard deviation of the blur of optics and pixels
     """
-    fit = fit_patterns(view, start.px, found.ids, decoder, blur_px)
+    fit = fit_patterns(view, start.px, found.ids, decoder, blur_px, nearer)
     # The two constraints of a square in space hold for them, too.
     square = as_squares(start.at_pixels(fit.corners_px), np.zeros((len(found.ids), 8, 1)), fit.covariance)
     floor = OF_DISPLAYED_PATTERN_PX if frame.displayed else OF_PATTERN_PX
@@ -182,21 +187,23 @@ def fitted_patterns(
     doubt = square.doubt * squared_sides(corners).mean(axis=1)
     doubt = np.where(fit.step_px > _CONVERGED_PX, np.maximum(doubt, fit.step_px**2), doubt)
     off = np.abs(corners - start.px).max(axis=(1, 2)) * decoder.cells / sides_px(start.px)
-    covariances, fitted = square.corner_covariances + floor**2 * _EYE, np.ones(len(doubt), dtype=bool)
+    covariances = square.corner_covariances + floor**2 * _EYE
     small = too_small_for_sides(start.px, decoder.cells, blur_px)
-    evident, refuted = small & found.certain & (off < _NEAR), ~fitted
+    evident, refuted = small & found.certain & (off < _NEAR), np.zeros(len(small), dtype=bool)
     others = np.flatnonzero(small & ~evident)
     if len(others):
         evident[others], refuted[others] = _verdicts(fit, found, others, frame, decoder, blur_px)
-    return RefinedCorners(corners, covariances, fit.contrast, fit.noise, doubt, fitted, small, evident, refuted)
+    return RefinedCorners(corners, covariances, fit.contrast, fit.noise, doubt, small, evident, refuted)
 
 
-def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: Decoder, blur_px: float) -> PatternFit:
+def fit_patterns(
+    view: PatternView, quads: FloatArray, ids: IntArray, decoder: Decoder, blur_px: float, nearer: int = 0
+) -> PatternFit:
     """Fits of the markers ``ids`` (Q,), upright in ``quads`` (Q, 4, 2), which are accurate to half a cell."""
     white, blur = decoder.patterns(ids, np.zeros_like(ids)), np.full(len(ids), blur_px)
     cell = sides_px(quads) / decoder.cells
     density = max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX))
-    grid = pattern_grid(decoder.cells, min(density, _MOST) if view.displayed else density)
+    grid = pattern_grid(decoder.cells, min(density, _MOST), nearer)
     prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
     at = linearised(view, quads, blur, white, grid)
     by_samples = at.information()
@@ -205,17 +212,17 @@ def fit_patterns(view: PatternView, quads: FloatArray, ids: IntArray, decoder: D
         move = _step(information, product)
         quads, blur = _moved(at, move, blur_px)
         step = np.abs(quads - at.corners_px).max(axis=(1, 2))
-        longest, other = step.max(initial=0.0), np.abs(blur - at.blur).max(initial=0.0) > _SAME_BLUR * blur_px
-        if (longest < _CONVERGED_PX and not other) or left == 0:
+        far = (step > _SAME_PX) | (np.abs(blur - at.blur) > _SAME_BLUR * blur_px)
+        anew, again = np.flatnonzero(far), np.flatnonzero(~far & (step > _CONVERGED_PX))
+        if left == 0 or not len(anew) + len(again):
             break
-        if longest > _SAME_PX or other:
-            at = linearised(view, quads, blur, white, grid)
-            by_samples = at.information()
-        else:
-            at = at.sampled_at(view, quads)
+        if len(anew):
+            there = linearised(view.only(anew), quads[anew], blur[anew], white[anew], grid)
+            at, by_samples[anew] = at.with_others(anew, there), there.information()
+        if len(again):
+            at = at.with_others(again, at.only(again).sampled_at(view.only(again), quads[again]))
     # The last step is so short that it changes residuals linearly.
-    hidden = grid.without_background((at.J.swapaxes(1, 2) @ move[..., None].astype(np.float32))[..., 0])
-    at = at._replace(rest=at.rest + hidden)
+    at = replace(at, rest=at.rest + (at.J.swapaxes(1, 2) @ move[..., None].astype(np.float32))[..., 0])
     covariance = _covariance(at, information, blur_px)
     return PatternFit(quads, covariance, at.contrast, np.sqrt(_noise_variance(at, blur_px)), step, at)
 
@@ -266,32 +273,28 @@ def _independent(at: PatternResiduals, blur_px: float) -> FloatArray:
 def _covariance(at: PatternResiduals, information: FloatArray, blur_px: float) -> FloatArray:
     """Covariance (Q, 8, 8) of the corners [px^2], by the ``information`` (Q, K, K) of samples with a variance of 1.
 
-    Neighbouring pixels that the model misses, it misses together: within a blur, or within a cell if that is more, as
-    behind smoke.
+    Neighbouring pixels that the model misses, it misses together: within a blur, or within a patch if that is more,
+    as behind smoke.
     """
     inverse: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    variance = np.maximum(_variance_of_samples(at, blur_px), _variance_by_cells(at, inverse))
+    variance = np.maximum(_variance_of_samples(at, blur_px), _variance_by_patches(at, inverse))
     covariance = inverse[:, CORNERS, CORNERS] * variance[:, None, None]
     # From u of all corners and v of all of them to u and v of each.
     return np.asarray(covariance.reshape(-1, 2, 4, 2, 4).transpose(0, 2, 1, 4, 3).reshape(-1, 8, 8))
 
 
-def _variance_by_cells(at: PatternResiduals, inverse: FloatArray) -> FloatArray:
-    """Variance (Q,) that samples would have if each cell missed the model as a whole, independently of the others.
+def _variance_by_patches(at: PatternResiduals, inverse: FloatArray) -> FloatArray:
+    """Variance (Q,) that samples would have if each patch missed the model as a whole, independently of the others.
 
-    The squares of what the residuals of single cells move the corners by are added (K.-Y. Liang, S. Zeger,
-    "Longitudinal data analysis using generalized linear models", 1986). These cells begin in the middle of the
-    pattern's. ``inverse`` (Q, K, K): of the information.
+    The squares of what the residuals of single patches move the corners by are added (K.-Y. Liang, S. Zeger,
+    "Longitudinal data analysis using generalized linear models", 1986). ``inverse`` (Q, K, K): of the information.
     """
-    count, parameters = at.J.shape[:2]
-    density = at.grid.density
-    cells = len(at.grid.along) // density
-    moves = at.grid.without_background(inverse[:, CORNERS].astype(np.float32) @ at.J) * at.rest[:, None]
-    moved = moves.reshape(count, -1, cells, density, cells, density).sum(axis=(3, 5))
-    # So much of what cells miss is left by a fit of so many parameters.
-    left = 1.0 - parameters / cells**2
+    moves = (inverse[:, CORNERS].astype(np.float32) @ at.J) * at.rest[:, None]
+    moved = at.grid.patches(moves).sum(axis=3)
+    # So much of what patches miss is left by a fit of so many parameters.
+    left = 1.0 - at.J.shape[1] / moved.shape[2]
     claimed = np.maximum(np.trace(inverse[:, CORNERS, CORNERS], axis1=1, axis2=2), TINY)
-    return np.asarray((moved * moved).sum(axis=(1, 2, 3)) / (left * claimed), dtype=np.float64)
+    return np.asarray((moved * moved).sum(axis=(1, 2)) / (left * claimed), dtype=np.float64)
 
 
 def _gradient(at: PatternResiduals) -> FloatArray:
@@ -353,8 +356,10 @@ def _content(at: PatternResiduals, cells: int) -> FloatArray:
     """Share (Q,) of the variance that a border around a plain square, each of any gray, leaves: that of the bits."""
     inner = np.pad(np.ones((cells - 2, cells - 2)), 1)
     squares = np.stack([np.ones((cells, cells)), inner])
-    drawn = at.y[:, None] @ squares @ at.x.swapaxes(1, 2)[:, None]
-    shown = at.grid.without_background(drawn.reshape(len(at.samples), 2, -1).astype(np.float32))
+    x, y = _weights(at, cells)
+    drawn = y[:, None] @ squares @ x.swapaxes(1, 2)[:, None]
+    drawn = at.grid.by_patches(drawn.reshape(len(at.samples), 2, -1).astype(np.float32))
+    shown = at.grid.without_background(drawn)
     product = shown @ at.samples[..., None]
     explained = product.swapaxes(1, 2) @ np.linalg.solve(shown @ shown.swapaxes(1, 2) + TINY * np.eye(2), product)
     return np.asarray(1.0 - explained[:, 0, 0] / np.maximum((at.samples * at.samples).sum(axis=1), TINY))
@@ -364,11 +369,17 @@ def _explained(at: PatternResiduals, which: IntArray, decoder: Decoder) -> Float
     """Shares (W, 4 M) of the variance that each marker's pattern explains in each turn, at the same corners."""
     black = decoder.black
     flat = black.reshape(len(black), -1)
-    background = at.grid.background.T.reshape(3, len(at.grid.along), -1)
+    background = at.grid.by_rows(at.grid.background.T)
     shares = np.empty((len(which), len(black)))
-    for row, (samples, x, y) in enumerate(zip(at.samples[which], at.x[which], at.y[which], strict=True)):
-        product = flat @ (y.T @ samples.reshape(background.shape[1:]) @ x).ravel()
+    at = at.only(which)
+    for row, (samples, x, y) in enumerate(zip(at.samples, *_weights(at, decoder.cells), strict=True)):
+        product = flat @ (y.T @ at.grid.by_rows(samples) @ x).ravel()
         size = ((y.T @ y) @ black @ (x.T @ x)).reshape(len(black), -1)
         size = (size * flat).sum(axis=1) - ((flat @ (y.T @ background @ x).reshape(3, -1).T) ** 2).sum(axis=1)
         shares[row] = product * product / np.maximum(size * (samples @ samples), TINY)
     return shares
+
+
+def _weights(at: PatternResiduals, cells: int) -> Float32Array:
+    """Weights (2, Q, S, m) of cells at samples along rows and along columns; the form of a lag is left out."""
+    return cell_weights(at.grid.along, cells, at.spread)[:, :, 0]

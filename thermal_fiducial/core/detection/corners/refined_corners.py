@@ -19,7 +19,6 @@ class RefinedCorners(Stacked):
     noise : (N,) standard deviation of a pixel about the model [counts]
     doubt : (N,) additional variance where the outline is inconsistent with a square, or has not converged, else 0;
         not in covariances [px^2]
-    by_pattern : (N,) whether their whole pattern was fitted
     small : (N,) whether their sides are too small to be measured, so that the fit of their pattern is the evidence
     evident : (N,) whether it is enough
     refuted : (N,) whether the image is clear, and something else than the marker fits about as well
@@ -30,7 +29,6 @@ class RefinedCorners(Stacked):
     contrast: FloatArray
     noise: FloatArray
     doubt: FloatArray
-    by_pattern: BoolArray
     small: BoolArray
     evident: BoolArray
     refuted: BoolArray
@@ -50,7 +48,7 @@ class RefinedCorners(Stacked):
     ) -> 'RefinedCorners':
         """Corners whose edges were fitted, not their pattern."""
         no = np.zeros(len(corners_px), dtype=bool)
-        return RefinedCorners(corners_px, covariances, contrast, noise, doubt, no, no, no, no)
+        return RefinedCorners(corners_px, covariances, contrast, noise, doubt, no, no, no)
 
     @staticmethod
     def none() -> 'RefinedCorners':

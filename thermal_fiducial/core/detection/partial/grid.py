@@ -212,7 +212,7 @@ def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) 
     if factor > 1:
         cropped = image[: camera.height * factor, : camera.width * factor]
         image = np.asarray(cv2.resize(cropped, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
-        to_tails, lag_blur = None, motion.lag[0] / factor
+        to_tails, lag_blur = None, motion.lag[0].mean(axis=0) / factor
     blur = math.hypot(blur_px / factor, math.sqrt((1.0 - 1.0 / factor**2) / 12.0))
 
     def displacement(points: FloatArray) -> FloatArray:

@@ -211,17 +211,14 @@ class MotionBlur(Stacked):
     removed: FloatArray
     #: (N, 2) standard deviation of the remaining motion blur, along the motion [px]
     spread: FloatArray
-
-    @property
-    def lag(self) -> FloatArray:
-        """Blur by lag (N, 2) as the image has it, tails and all: its mean and its standard deviation [px]."""
-        return self.spread if self.to_tails is None else self.spread / SPREAD
+    #: (N, 4, 2) mean displacement by the whole lag [px]
+    lag: FloatArray
 
     @staticmethod
     def none(count: int) -> 'MotionBlur':
         """Of ``count`` markers at rest."""
         still = np.zeros((count, 4, 2))
-        return MotionBlur(None, still, still, still[:, 0])
+        return MotionBlur(None, still, still, still[:, 0], still)
 
 
 def motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlur:
@@ -229,11 +226,11 @@ def motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlur
     lag_blur = np.zeros_like(places.at.px) if twist is None else places.lag_blur(twist, frame.lag)
     mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
     if twist is None or (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
-        return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
+        return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean, lag_blur)
     removed = removed_displacement(places, twist, frame)
     shift = lag_blur - removed + rolling
     to_tails = lag_tail_maps(places.at.px + shift, removed / (1.0 - REMAINING))
-    return MotionBlur(to_tails, shift, removed, SPREAD * mean)
+    return MotionBlur(to_tails, shift, removed, SPREAD * mean, lag_blur)
 
 
 def removed_displacement(places: Places, twist: Twist, frame: Frame) -> FloatArray:
