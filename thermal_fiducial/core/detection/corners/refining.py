@@ -164,8 +164,8 @@ def _by_patterns(
 def _with_lag_tails(frame: Frame, start: ImagePoints, blur: MotionBlur, cells: int) -> BoolArray:
     """Of which markers (N,) lag tails are part of the pattern: in pictures for a display, whose scale bends them.
 
-    Where the lag is long, what is farther from the marker than the model knows reaches into it: tails are removed from
-    gray levels there, as if these were counts.
+    Where the lag is long, patterns with tails are worse than those of gray levels from which tails are removed, as if
+    these were counts.
     """
     lag_px = np.hypot(*blur.lag.mean(axis=1).T)
     shows = frame.displayed and lag_px.max(initial=0.0) > _LAG_THAT_SHOWS_PX
