@@ -224,7 +224,7 @@ def lagging(cell, lag_blur, beyond=0.0):
     pattern = np.kron(np.pad(pattern, 1, constant_values=1), np.ones((cell * fine, cell * fine)))
     scene = np.pad(pattern.astype(np.float32), place * fine, constant_values=beyond)
     # The response at some ages, evenly spread in what they weigh.
-    ages = -np.log(1.0 - (np.arange(100) + 0.5) / 100)
+    ages = -np.log(1.0 - (np.arange(400) + 0.5) / 400)
     seen = sum(moved(scene, fine * np.array(lag_blur) * age) for age in ages) / len(ages)
     size = scene.shape[0] // fine
     image = cv2.resize(cv2.GaussianBlur(seen, (0, 0), 0.6 * fine), (size, size), interpolation=cv2.INTER_AREA)
