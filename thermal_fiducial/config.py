@@ -617,7 +617,7 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
         'Period at which a changed map is written to <map_file>.autosave; 0: never.',
         unit='s',
         minimum=0.0,
-        least=1.0,
+        least=0.05,
         maximum=3600.0,
         needs=('map_file',),
     )
