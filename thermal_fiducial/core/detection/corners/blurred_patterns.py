@@ -229,7 +229,8 @@ def blurred(
         farther = np.float32(age - 1.0) * (part.slopes * stretched.swapaxes(0, 1)).sum(axis=0)
         part = part._replace(value=part.value - farther)
         parts.append([np.float32(weight) * field for field in part])
-    return PatternModel(*(np.sum(fields, axis=0) for fields in zip(*parts, strict=True))), spread + by_lag
+    sums = (np.asarray(np.sum(fields, axis=0), dtype=np.float32) for fields in zip(*parts, strict=True))
+    return PatternModel(*sums), spread + by_lag
 
 
 def _gaussian(
