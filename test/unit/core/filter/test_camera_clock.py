@@ -42,6 +42,16 @@ def flown(step=0.0, late=LATE, pose_rate=30.0, wrong=False):
     return ekf, states, lost, flight
 
 
+def stepping(flight, step, at=AT, scatter=lambda: 0.0):
+    """What arrives of a flight whose poses' stamps step at ``at``; ``scatter()``: more delay of the next one [s]."""
+    arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
+    for pose in flight.poses:
+        later = pose.stamp_ns - START_NS >= at * 1e9
+        arrives = pose.stamp_ns + round(1e9 * (LATE + scatter()))
+        arrivals.append((arrives, 1, replace(pose, stamp_ns=pose.stamp_ns + round(1e9 * step * later))))
+    return in_order(arrivals)
+
+
 @pytest.mark.parametrize(
     'step', [0.05, -0.5, *(pytest.param(step, marks=pytest.mark.nightly) for step in (-0.05, 0.2, 1.0, -1.0))]
 )
@@ -59,13 +69,8 @@ def test_a_step_is_followed(step):
 def test_a_step_by_whole_frames_is_followed_to_stamps_that_were_there_before(frames):
     """25 Hz, stamps counted in frames, IMU at 200 Hz: the delay is exact, and so is the stamp of the pose before."""
     flight = Flight(seed=3, seconds=5.0, pose_rate=25.0)
-    arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
-    for pose in flight.poses:
-        later = pose.stamp_ns - START_NS >= AT * 1e9
-        stepped = replace(pose, stamp_ns=pose.stamp_ns + frames * 40_000_000 * later)
-        arrivals.append((pose.stamp_ns + round(1e9 * LATE), 1, stepped))
     ekf = PoseEkf(config())
-    states, lost = run_watched(ekf, in_order(arrivals))
+    states, lost = run_watched(ekf, stepping(flight, 0.04 * frames))
     off, _ = errors(flight, states, AT + 0.5)
     assert off.max() < 0.05
     assert not lost[-len(off) :].any()
@@ -76,13 +81,8 @@ def test_a_step_by_whole_frames_is_followed_to_stamps_that_were_there_before(fra
 def test_a_step_is_known_no_better_than_the_delays_scatter(step):
     """By 20 ms, exponentially: what is taken out of the stamps is off by as much, and the offset finds the rest."""
     flight, rng = Flight(seed=10, seconds=7.5), np.random.default_rng(10)
-    arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
-    for pose in flight.poses:
-        later = pose.stamp_ns - START_NS >= 4.0e9
-        arrives = pose.stamp_ns + round(1e9 * LATE + rng.exponential(2e7))
-        arrivals.append((arrives, 1, replace(pose, stamp_ns=pose.stamp_ns + round(1e9 * step * later))))
     ekf = PoseEkf(config())
-    states, lost = run_watched(ekf, in_order(arrivals))
+    states, lost = run_watched(ekf, stepping(flight, step, 4.0, lambda: rng.exponential(0.02)))
     off, _ = errors(flight, states, 4.0)
     # As good as without a step; with the step's error unknown to the covariance it was 58 mm, for seconds.
     assert off.max() < 0.03
@@ -93,13 +93,8 @@ def test_a_step_is_known_no_better_than_the_delays_scatter(step):
 def test_a_step_is_followed_where_delays_scatter_by_more_than_frames(step):
     """By 80 ms, exponentially: no five poses agreed to 50 ms, and the filter reset to poses of another instant."""
     flight, rng = Flight(seed=3, seconds=7.0), np.random.default_rng(3)
-    arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
-    for pose in flight.poses:
-        later = pose.stamp_ns - START_NS >= 4.0e9
-        arrives = pose.stamp_ns + round(1e9 * LATE + rng.exponential(8e7))
-        arrivals.append((arrives, 1, replace(pose, stamp_ns=pose.stamp_ns + round(1e9 * step * later))))
     ekf = PoseEkf(config())
-    states, lost = run_watched(ekf, in_order(arrivals))
+    states, lost = run_watched(ekf, stepping(flight, step, 4.0, lambda: rng.exponential(0.08)))
     off, _ = errors(flight, states, 4.0)
     # Twice what it is without a step; it was half a metre and more.
     assert off.max() < 0.05
@@ -149,14 +144,9 @@ def test_a_clock_that_is_set_soon_after_the_start_is_not_set_back_by_a_wrong_pos
 
 def test_a_verdict_has_the_stamp_that_came():
     """After a step too: the detector takes the clock offset from both stamps of ``camera_clock``."""
-    flight, step_ns = Flight(seed=3, seconds=5.0), 300_000_000
+    flight = Flight(seed=3, seconds=5.0)
     ekf = PoseEkf(config())
-    arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
-    for pose in flight.poses:
-        later = pose.stamp_ns - START_NS >= AT * 1e9
-        stamped = replace(pose, stamp_ns=pose.stamp_ns + step_ns * later)
-        arrivals.append((pose.stamp_ns + round(1e9 * LATE), 1, stamped))
-    for arrival in in_order(arrivals):
+    for arrival in stepping(flight, 0.3):
         if isinstance(arrival, ImuSample):
             ekf.add_imu(arrival)
         else:
