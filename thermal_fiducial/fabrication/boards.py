@@ -7,13 +7,11 @@ import numpy as np
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing
-from thermal_fiducial.fabrication.plate import arrow, mounting_points, PlateOptions, text
+from thermal_fiducial.fabrication.plate import arrow, mounting_points, PlateOptions, text, WALL_MM
 from thermal_fiducial.fabrication.shape import contour, Rectangle, trace
 
 #: Most circles of a board: more would be too small for any camera, and fill the memory.
 _MOST_CIRCLES = 10_000
-#: Acrylic between circles and mounting holes, as ``--min-web`` asks of markers.
-_WEB_MM = 3.0
 
 
 def asymmetric_circles(columns: int, rows: int, spacing: float) -> FloatArray:
@@ -41,7 +39,7 @@ def circle_board(columns: int, rows: int, spacing: float, diameter: float, optio
     if columns * rows > _MOST_CIRCLES:
         raise InputError(f'a circle grid of {columns} x {rows}: {_MOST_CIRCLES} circles at most')
     # Small circles must not run into the mounting holes in the corners.
-    apart = 0.5 * (diameter + options.hole_diameter) + _WEB_MM
+    apart = 0.5 * (diameter + options.hole_diameter) + WALL_MM
     margin = max(2.0 * spacing, _hole_inset(options) + apart / np.sqrt(2.0))
     centres = asymmetric_circles(columns, rows, spacing)
     width, height = centres.max(axis=0) + 2.0 * margin

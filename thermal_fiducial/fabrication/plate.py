@@ -19,8 +19,8 @@ from thermal_fiducial.fabrication.shape import contour, Rectangle, trace
 
 MOUNTS = ('ears', 'frame', 'none')
 
-# Width of acrylic around a mounting hole [mm]: the thickness of usual sheets, the least that a bolt may clamp.
-_WALL_MM = 3.0
+#: Width of acrylic around a mounting hole [mm]: the thickness of usual sheets, the least that a bolt may clamp.
+WALL_MM = 3.0
 # Sides and thicknesses that the nodes take, without foil [mm]: other numbers are probably of another unit.
 _SIZES_MM, _THICKNESSES_MM = (5.0, 10_000.0), (0.1, 50.0)
 _POSITIVE = ('hole_diameter', 'bridge_width', 'quiet_cells', 'frame_width', 'tie_width')
@@ -69,7 +69,7 @@ class PlateOptions:
             allowed = '{:g} to {:g}'.format(*_THICKNESSES_MM)
             raise InputError(f'a plate of {self.thickness:g} mm: thicknesses are in millimetres, {allowed}')
         self._require_lengths()
-        if self.mount == 'frame' and self.frame_width < self.hole_diameter + _WALL_MM:
+        if self.mount == 'frame' and self.frame_width < self.hole_diameter + WALL_MM:
             raise InputError(f'a frame of {self.frame_width:g} mm has no room for holes of {self.hole_diameter:g} mm')
 
     def _require_lengths(self) -> None:
@@ -167,7 +167,7 @@ def neck_arm(options: PlateOptions, cells: int) -> float:
 
 
 def _tab_length(options: PlateOptions) -> float:
-    return options.hole_diameter + 2.0 * _WALL_MM
+    return options.hole_diameter + 2.0 * WALL_MM
 
 
 def ear_length(options: PlateOptions) -> float:
