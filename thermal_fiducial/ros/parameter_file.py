@@ -54,7 +54,8 @@ def _limits(limits: Any) -> Iterator[str]:
         yield f'One of: {", ".join(filter(None, limits["choices"]))}.'
     low, high = limits['minimum'], limits['maximum']
     if low is not None and high is not None:
-        yield f'From {low:g} to {high:g}.'
+        least = limits['least']
+        yield f'0, or from {least:g} to {high:g}.' if least else f'From {low:g} to {high:g}.'
     elif low is not None:
         yield f'At least {low:g}.'
     elif high is not None:
