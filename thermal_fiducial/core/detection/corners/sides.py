@@ -14,7 +14,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Corners between which the sides lie: top and bottom from left to right, left and right from the top down.
 STARTS, ENDS = np.array([0, 3, 0, 1]), np.array([1, 2, 3, 2])
@@ -181,11 +181,6 @@ def _seen(
     fresh &= (whole >= 0.0) & (whole <= end) & (base >= _BOTH_SIDES) & (base <= far - _BOTH_SIDES)
     place = base + np.arange(-half, half + 1)[:, None, None, None]
     return fresh, (place >= 0.0) & (place <= far)
-
-
-def white_behind_border(bits: Gray) -> BoolArray:
-    """Whether cells (M, 4, n) behind the borders of markers with ``bits`` (M, n, n) are white, side by side."""
-    return np.stack([bits[:, 0], bits[:, -1], bits[:, :, 0], bits[:, :, -1]], axis=1) > 0
 
 
 def blur_of(sides: Sides, optics: float, motion: FloatArray) -> Blur:
