@@ -220,7 +220,7 @@ def fit_patterns(
             there = linearised(view.only(anew), quads[anew], blur[anew], white[anew], grid)
             at, by_samples[anew] = at.with_others(anew, there), there.information()
         if len(again):
-            at = at.with_others(again, at.only(again).sampled_at(view.only(again), quads[again]))
+            at = at.sampled_at(view, quads[again], again)
     # The last step is so short that it changes residuals linearly.
     at = replace(at, rest=at.rest + (at.J.swapaxes(1, 2) @ move[..., None].astype(np.float32))[..., 0])
     covariance = _covariance(at, information, blur_px)

@@ -20,7 +20,7 @@ from thermal_fiducial.core.detection.corners.blurred_patterns import (
     PatternGrid,
     PatternView,
 )
-from thermal_fiducial.core.types import Float32Array, FloatArray, Stacked, TINY
+from thermal_fiducial.core.types import changed, Float32Array, FloatArray, IntArray, Stacked, TINY
 
 # Least local contrast, as a share of that of the whole marker: gray levels rise with counts. Without it, fits of
 # markers behind dense smoke end up to 2 px off.
@@ -38,7 +38,7 @@ class Unevenness(Stacked):
 
     #: (Q, n * n, P / (n * n)) the pattern without its mean in each patch, of length 1 there
     pattern: Float32Array
-    #: (Q, n * n) shares of the mean and of the pattern in each patch that are taken out
+    #: (Q, 1) and (Q, n * n) shares of the mean and of the pattern in each patch that are taken out
     of_level: Float32Array
     of_contrast: Float32Array
     #: (Q, n * n) what the contrast of each patch is more than the linear one
@@ -66,7 +66,7 @@ class Unevenness(Stacked):
         of_level = _beyond(level, noise, np.ones_like(strength))
         of_contrast = _beyond(contrast, noise, strength) * strength
         more = of_contrast / (noise + of_contrast) * contrast / length
-        shares = (1.0 - np.sqrt(noise / (noise + part)) for part in (of_level + 0.0 * strength, of_contrast))
+        shares = (1.0 - np.sqrt(noise / (noise + part)) for part in (of_level, of_contrast))
         return Unevenness(unit, *(part.astype(np.float32) for part in (*shares, more)))
 
     def whitened(self, values: Float32Array) -> Float32Array:
@@ -108,11 +108,20 @@ class PatternResiduals(Stacked):
     #: None: nothing is uneven
     unevenness: Unevenness | None
 
-    def sampled_at(self, view: PatternView, quads: FloatArray) -> 'PatternResiduals':
-        """The same at corners ``quads`` (Q, 4, 2) so near that the patterns on the markers stay."""
-        samples = self.grid.without_background(view.gray(quads, self.grid))
-        amounts, rest = _fitted(-self.J[:, LINEAR], _whitened(samples[:, None], self.unevenness)[:, 0])
-        return replace(self, corners_px=quads, samples=samples, rest=rest, amounts=amounts)
+    def sampled_at(self, view: PatternView, quads: FloatArray, which: IntArray) -> 'PatternResiduals':
+        """The same with ``which`` (W,) at corners ``quads`` (W, 4, 2) so near that the patterns on them stay."""
+        samples = self.grid.without_background(view.only(which).gray(quads, self.grid))
+        whitened = samples
+        if self.unevenness is not None:
+            whitened = self.unevenness.only(which).whitened(samples[:, None])[:, 0]
+        amounts, rest = _fitted(-self.J[which, LINEAR], whitened)
+        return replace(
+            self,
+            corners_px=changed(self.corners_px, which, quads),
+            samples=changed(self.samples, which, samples),
+            rest=changed(self.rest, which, rest),
+            amounts=changed(self.amounts, which, amounts),
+        )
 
     def information(self) -> FloatArray:
         """Information (Q, 9 + L, 9 + L) of samples with a variance of 1."""
@@ -162,10 +171,6 @@ def linearised(
         J = uneven.whitened(J)
         amounts, rest = _fitted(-J[:, LINEAR], uneven.whitened(samples[:, None])[:, 0])
     return PatternResiduals(quads, blur, to_cells, spread, samples, rest, amounts, J, grid, uneven)
-
-
-def _whitened(values: Float32Array, unevenness: Unevenness | None) -> Float32Array:
-    return values if unevenness is None else unevenness.whitened(values)
 
 
 def _apart_px(grid: PatternGrid, to_cells: FloatArray) -> FloatArray:

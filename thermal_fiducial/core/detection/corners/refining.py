@@ -127,8 +127,7 @@ def _measured(
     if not whole.any():
         return refined
     fitted = _by_patterns(frame, found.only(whole), start.only(whole), blur.only(whole), decoder, config)
-    order = np.argsort(np.concatenate([np.flatnonzero(~whole), np.flatnonzero(whole)]))
-    return refined.joined(fitted).only(order)
+    return refined.joined(fitted).only(_places(whole))
 
 
 def _by_patterns(
@@ -157,8 +156,13 @@ def _by_patterns(
             view = view._replace(to_tails=moving.to_tails, motion=moving.spread)
         fitted = fitted_patterns(frame, found.only(which), there, view, group // 2, decoder, config.blur_px)
         refined = refined.joined(fitted)
-    refined = refined.only(np.argsort(np.argsort(groups, kind='stable')))
+    refined = refined.only(_places(groups))
     return replace(refined, corners_px=refined.corners_px - kept)
+
+
+def _places(groups: BoolArray | IntArray) -> IntArray:
+    """Where each of N items of some ``groups`` (N,) is in a batch that has these one after the other, (N,)."""
+    return np.argsort(np.argsort(groups, kind='stable'))
 
 
 def _with_lag_tails(frame: Frame, start: ImagePoints, blur: MotionBlur, cells: int) -> BoolArray:
