@@ -49,8 +49,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._frames.note_imu_frame(message_bytes.frame_id(message))
         odometry = self.filter.add_imu(sample)
         self._status.after_imu(sample.stamp_ns)
-        if odometry is not None:
-            self._outputs.send(odometry, lost=self.filter.lost, jumps=self._status.jumps)
+        self._outputs.send(odometry, lost=self.filter.lost, jumps=self._status.jumps)
 
     def _on_camera_pose(self, message: bytes) -> None:
         self.take_waiting()

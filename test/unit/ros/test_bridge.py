@@ -144,6 +144,26 @@ def test_the_smooth_topic_is_another_one_and_feeds_the_bridge():
     assert 0.0 < steps[1] < 0.5 * steps[0]
 
 
+@pytest.mark.parametrize('reset', [False, True])
+def test_the_smooth_output_does_not_continue_a_pose_that_was_lost(reset):
+    """An autopilot has had no pose meanwhile, and would get one 0.6 m off for seconds, at the claim of the estimate."""
+    with ros_graph() as graph:
+        node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], bridge_rate=1000.0, smoothing_time=10.0)
+        graph.listen(OdometryMessage, 'bridge/odometry')
+        graph.spin_until(lambda: all(output.listeners for output in node.outputs if output.topic == '/bridge/odometry'))
+        fly(graph, range(100))
+        before = counts(node)['/bridge/odometry']
+        if reset:
+            node.filter.reset()
+        fly(graph, range(100, 400), step=0.6)
+        graph.spin_until(lambda: len(graph.heard['bridge/odometry']) == graph.published(node, 'bridge/odometry'))
+        x = np.array([message.pose.pose.position.x for message in graph.heard['bridge/odometry']])
+    # At rest the filter knows its position to a few millimetres; an IMU message of 5 ms ends the old pose.
+    assert np.abs(x[: before - 1]).max() < 0.02
+    assert np.abs(x[-50:] - 0.6).max() < 0.02
+    assert not np.any((x > 0.1) & (x < 0.5))
+
+
 @pytest.mark.parametrize(
     ('parameters', 'line'),
     [

@@ -94,7 +94,7 @@ class SmoothOutput:
     """A pose without steps, for controllers that need one: it lags behind, and its covariance is not consistent.
 
     It integrates the filter's twist, and approaches the filter's pose with a time constant. Where stamps go back it
-    starts again.
+    begins again.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -115,6 +115,10 @@ class SmoothOutput:
             self._T = odometry.T_map_body @ transform(rotation, share * left[:3, 3])
         self._consistent = odometry
         return replace(odometry, T_map_body=self._T)
+
+    def begin_again(self) -> None:
+        """Take over the filter's next pose as it is: nobody flies on those before."""
+        self._consistent = None
 
 
 def _motion(before: Odometry, now: Odometry, dt: float) -> FloatArray:

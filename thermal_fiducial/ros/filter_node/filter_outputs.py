@@ -49,15 +49,20 @@ class FilterOutputs:
         self._bridge = FlightControllerBridge(node, config, fault)
         self._transforms = TransformBroadcaster(node, config, frames, fault) if config.publish_tf else None
 
-    def send(self, odometry: Odometry, *, lost: bool, jumps: int) -> None:
+    def send(self, odometry: Odometry | None, *, lost: bool, jumps: int) -> None:
         """Publish the state of the IMU frame after an IMU message, transformed to the robot's frame.
 
         Parameters
         ----------
+        odometry : None: the filter has none
         lost : whether the pose is unfit to fly on
         jumps : number of jumps of the pose so far
         """
-        smooth = self._smoother.follow(odometry) if self._smoother else None
+        smooth = self._smoother.follow(odometry) if self._smoother and odometry else None
+        if lost and self._smoother:
+            self._smoother.begin_again()
+        if odometry is None:
+            return
         if (T_imu_base := self._frames.T_imu_base) is not None:
             odometry = in_frame(odometry, T_imu_base)
             smooth = None if smooth is None else in_frame(smooth, T_imu_base)

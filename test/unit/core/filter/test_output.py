@@ -52,3 +52,10 @@ def test_a_step_too_large_to_spread_and_a_clock_that_goes_back_start_it_anew(k):
     np.testing.assert_allclose(output.follow(new).T_map_body, new.T_map_body, atol=1e-12)
     after = replace(new, stamp_ns=new.stamp_ns + STEP_NS, velocity_body=np.zeros(3))
     assert aside(output.follow(after)) == pytest.approx(aside(new), abs=1e-12)
+
+
+def test_what_begins_again_does_not_continue_a_pose_that_was_wrong():
+    output = SmoothOutput(SECONDS)
+    output.follow(at(0))
+    output.begin_again()
+    np.testing.assert_array_equal(output.follow(at(1, 0.5)).T_map_body, at(1, 0.5).T_map_body)
