@@ -15,6 +15,7 @@ from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import OK, StageNode, WARN
 from thermal_fiducial.ros.frames.landing_pad import for_mavros, pad_in_map, what_lacks
+from thermal_fiducial.ros.frames.map_corrections import MapCorrections
 from thermal_fiducial.ros.frames.robot_frames import RobotFrames
 from thermal_fiducial.ros.messages import clouds, convert, message_bytes
 from thermal_fiducial.ros.process.run import run
@@ -34,15 +35,13 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         #: stamps of frames that show the pad and wait for their camera pose
         self._frames: OrderedDict[int, None] = OrderedDict()
         self._in_view = False
+        self._corrections = MapCorrections()
         self._target = self.advertise(PoseStamped, 'landing_target')
         self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT, raw=True)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
+        self._corrections.follow_moves(self)
         self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
         RobotFrames(self)
-
-    @property
-    def _T_body_camera(self) -> FloatArray:
-        return camera_in_body(self.config)
 
     def _on_map(self, message: PointCloud2) -> None:
         pad, (poses, quarantined) = self.config.landing_pad, clouds.map_poses(message)
@@ -61,7 +60,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
             if len(self._frames) > _WAITING:
                 self._frames.popitem(last=False)
         elif self._needs_no_map and np.isfinite(seen.branches[0, 0]).all():
-            self._send_in_body(stamp, self._T_body_camera @ seen.branches[0, 0])
+            self._send_in_body(stamp, camera_in_body(self.config) @ seen.branches[0, 0])
 
     @property
     def _needs_no_map(self) -> bool:
@@ -69,12 +68,13 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         return len(self.config.landing_pad) == 1 and self.config.landing_target_frame == 'body'
 
     def _on_camera_pose(self, message: bytes) -> None:
-        pose = message_bytes.camera_pose(message)
+        pose = self._corrections.in_present_map(message_bytes.camera_pose(message))
         if self._T_map_pad is None or pose.stamp_ns not in self._frames:
             return
         del self._frames[pose.stamp_ns]
         if self.config.landing_target_frame == 'body':
-            self._send_in_body(pose.stamp_ns, self._T_body_camera @ inverse(pose.T_map_camera) @ self._T_map_pad)
+            T_camera_pad = inverse(pose.T_map_camera) @ self._T_map_pad
+            self._send_in_body(pose.stamp_ns, camera_in_body(self.config) @ T_camera_pad)
         else:
             self._send(pose.stamp_ns, self.config.map_frame, self._T_map_pad)
 

@@ -37,10 +37,10 @@ def graph(graph):
     return graph
 
 
-def marker_map(ids=(7, 8), quarantined=()):
+def marker_map(ids=(7, 8), quarantined=(), T_new_old=np.eye(4)):
     rows = np.zeros(len(ids), MAP_DTYPE)
     for row, marker_id in zip(rows, ids, strict=True):
-        T = T_MAP_MARKERS[marker_id]
+        T = T_new_old @ T_MAP_MARKERS[marker_id]
         row['id'], row['size'], row['trusted'] = marker_id, 0.3, marker_id not in quarantined
         row['x'], row['y'], row['z'] = T[:3, 3]
         row['qx'], row['qy'], row['qz'], row['qw'] = quaternion_from_rotation(T[:3, :3])
@@ -105,6 +105,21 @@ def test_px4_gets_it_in_the_map_that_its_odometry_is_in(graph):
     (message,) = heard(graph)
     assert message.header.frame_id == 'map'
     np.testing.assert_allclose(convert.transform_of(message.pose)[:3, 3], PAD, atol=1e-6)
+
+
+def test_a_frame_from_before_a_correction_of_the_map_has_the_pad_where_it_is(graph):
+    """Its camera pose is one in the map as of its stamp, also where it comes after the corrected map."""
+    graph.add(LandingTarget, landing_pad=[7, 8], **EXTRINSICS)
+    T_new_old = transform(so3_exp([0.0, 0.0, 0.3]), [1.0, 2.0, 0.0])
+    graph.send('marker_map', marker_map(), profile=qos.LATCHED)
+    graph.send('markers', markers(7))
+    graph.send('map_correction', convert.transform_message(T_new_old, STAMP, 'map', 'map_before'))
+    graph.send('marker_map', marker_map(T_new_old=T_new_old), profile=qos.LATCHED)
+    graph.send('camera_pose', camera_pose())
+    (message,) = heard(graph)
+    forward, left, up = inverse(T_MAP_BODY)[:3, :3] @ (PAD - T_MAP_BODY[:3, 3])
+    # 1e-6: poses of markers travel as float32
+    np.testing.assert_allclose(mavros_ned(message)[0], [forward, -left, -up], atol=1e-6)
 
 
 def test_a_marker_of_the_pad_in_quarantine_is_named(graph):

@@ -72,12 +72,18 @@ class MapCorrections:
         def on_error(message: bytes) -> None:
             self.note_error(message_bytes.map_error(message))
 
+        node.subscribe_lazily(PoseWithCovarianceStamped, 'camera_pose/map_error', on_error, qos.RESULT)
+        self.follow_moves(node, on_moved)
+
+    def follow_moves(self, node: CountingNode, on_moved: Callable[[FloatArray], None] | None = None) -> None:
+        """Subscribe to corrections of the map alone."""
+
         def on_correction(message: TransformStamped) -> None:
             stamp_ns, T_new_old = convert.correction_of(message)
             self.add(stamp_ns, T_new_old)
-            on_moved(T_new_old)
+            if on_moved is not None:
+                on_moved(T_new_old)
 
-        node.subscribe_lazily(PoseWithCovarianceStamped, 'camera_pose/map_error', on_error, qos.RESULT)
         node.subscribe(TransformStamped, 'map_correction', on_correction, qos.RESULT)
 
     def add(self, stamp_ns: int, T_new_old: FloatArray) -> None:
