@@ -29,6 +29,8 @@ T_MAP_MARKERS = {
     8: transform(so3_exp(np.array([0.0, 0.0, -1.0])), [3.6, -1.6, 0.1]),
 }
 PAD = np.array([3.4, -1.6, 0.05])
+#: T_new_old of a map that has not moved.
+AT_HOME = np.eye(4)
 
 
 @pytest.fixture
@@ -37,7 +39,7 @@ def graph(graph):
     return graph
 
 
-def marker_map(ids=(7, 8), quarantined=(), T_new_old=np.eye(4)):
+def marker_map(ids=(7, 8), quarantined=(), T_new_old=AT_HOME):
     rows = np.zeros(len(ids), MAP_DTYPE)
     for row, marker_id in zip(rows, ids, strict=True):
         T = T_new_old @ T_MAP_MARKERS[marker_id]
