@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from enum import Enum
 import math
 
+from thermal_fiducial.core.filter.camera_clock import SMALLEST_STEP_NS
 from thermal_fiducial.core.measurements import Condition, ImuSample
 from thermal_fiducial.core.types import SECOND_NS
 
@@ -94,9 +95,11 @@ class ImuInput:
         self._strays: StrayRun | None = None
         #: longest recent step [ns]
         self.longest_ns = 0.0
+        #: the longest of those that may hide a small step of the clock: a long gap says nothing of these
+        self._longest_short_ns = 0.0
         #: longest step [ns] that is accepted at once, without waiting for a sample that follows
         self._usual_ns: float = min(GAP_NS, self._max_gap_ns)
-        #: by how much the step to the last sample that was used exceeds the longest recent one, if by far [ns]
+        #: by how much the step to the last sample that was used exceeds the longest recent short one, if by far [ns]
         self.excess_ns = 0
         #: jump of the stamps at the last sample that was used [ns]; 0 for a usual step
         self.jump_ns = 0
@@ -136,10 +139,13 @@ class ImuInput:
         assert self._last_ns is not None
         step_ns = stamp_ns - self._last_ns
         gap_ns = jump_ns or step_ns
-        unusual = gap_ns > LOST_FACTOR * self.longest_ns > 0.0
-        self.excess_ns = round(gap_ns - self.longest_ns) if unusual else 0
+        unusual = gap_ns > LOST_FACTOR * self._longest_short_ns > 0.0
+        self.excess_ns = round(gap_ns - self._longest_short_ns) if unusual else 0
         if 0 < step_ns <= self._max_gap_ns:
-            self.longest_ns = max(self.longest_ns * (1.0 - step_ns / MEMORY_NS), step_ns)
+            decayed = 1.0 - step_ns / MEMORY_NS
+            self.longest_ns = max(decayed * self.longest_ns, step_ns)
+            short_ns = step_ns if self.excess_ns < SMALLEST_STEP_NS else 0
+            self._longest_short_ns = max(decayed * self._longest_short_ns, short_ns)
             self._usual_ns = min(max(UNUSUAL_FACTOR * self.longest_ns, GAP_NS), self._max_gap_ns)
         self._last_ns, self._strays, self.jump_ns = stamp_ns, None, jump_ns
 

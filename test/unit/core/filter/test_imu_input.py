@@ -114,6 +114,14 @@ def test_the_end_of_a_gap_is_measured_from_its_first_sample(imu):
     assert found[-4:] == pytest.approx([0.0, 0.0, 35.0, 0.0], abs=0.05)
 
 
+def test_a_long_gap_does_not_make_short_ones_usual(imu):
+    """A step of the clock by 20 ms in the seconds behind it has to be noticed."""
+    found = excesses(imu, [*range(0, 500, 5), *range(895, 1500, 5), 1520, 1525, 1545])
+    # The gap itself is noticed with its third sample; the second step of 20 ms is as long as the first.
+    assert max(found[100:103]) == pytest.approx(395.0, abs=0.05)
+    assert found[-3:] == pytest.approx([20.0, 0.0, 0.0], abs=0.05)
+
+
 def stamped(imu, noise, stamps_ns):
     """Verdicts on samples of noise with these stamps."""
     readings = noise(len(stamps_ns))
