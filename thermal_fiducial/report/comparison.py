@@ -6,6 +6,7 @@ relative pose error is over 1 m of path (``--delta 1 --delta_unit m``).
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 from evo.core import metrics as evo_metrics
 from evo.core import sync
 from evo.core.filters import FilterException
+from evo.core.geometry import GeometryException
 from evo.core.trajectory import PoseTrajectory3D
 import numpy as np
 
@@ -146,14 +148,15 @@ def evo_numbers(estimate: Trajectory, truth: Trajectory) -> dict[str, dict[str, 
         true, found = sync.associate_trajectories(_of_evo(truth), _of_evo(estimate), max_diff=MOST_APART_S)
     except sync.SyncException:
         return {}
-    aligned = PoseTrajectory3D(poses_se3=list(found.poses_se3), timestamps=found.timestamps)
-    aligned.align(true)
     translation, angle = evo_metrics.PoseRelation.translation_part, evo_metrics.PoseRelation.rotation_angle_deg
     result = {
         'ape_translation': _statistics(evo_metrics.APE(translation), true, found, 1e3),
-        'ape_translation_aligned': _statistics(evo_metrics.APE(translation), true, aligned, 1e3),
         'ape_rotation': _statistics(evo_metrics.APE(angle), true, found, 1.0),
     }
+    aligned = PoseTrajectory3D(poses_se3=list(found.poses_se3), timestamps=found.timestamps)
+    with suppress(GeometryException):  # poses in a point or on a line
+        aligned.align(true)
+        result['ape_translation_aligned'] = _statistics(evo_metrics.APE(translation), true, aligned, 1e3)
     for name, relation, scale in (('rpe_translation', translation, 1e3), ('rpe_rotation', angle, 1.0)):
         try:
             result[name] = _statistics(evo_metrics.RPE(relation, 1.0, evo_metrics.Unit.meters), true, found, scale)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 import json
+from shutil import copytree
 
 import pytest
 from support.run_folders import make_run
@@ -114,6 +115,19 @@ def test_a_run_without_truth_is_marked_so(runs, tmp_path, capsys):
     assert line in page.read_text()
     # A comparison has no overview to lead to.
     assert 'Overview' not in page.read_text()
+
+
+def test_a_run_of_a_robot_at_rest_has_errors_though_nothing_aligns_it(runs, tmp_path):
+    """Poses in a point or on a line may turn about it."""
+    folder = tmp_path / 'rest'
+    copytree(runs[1], folder)
+    truth = (folder / 'truth.tum').read_text().splitlines()
+    _, at_rest = truth[0].split(' ', 1)
+    (folder / 'truth.tum').write_text('\n'.join(f'{line.split()[0]} {at_rest}' for line in truth))
+    found = compare([runs[0], folder])
+    assert set(found.numbers['a']['evo']) > set(found.numbers['rest']['evo']) >= {'ape_translation', 'ape_rotation'}
+    assert 'ape_translation_aligned' not in found.numbers['rest']['evo']
+    assert found.note == ''
 
 
 def test_runs_called_alike_have_their_folder_s_name_too(tmp_path):
