@@ -105,6 +105,9 @@ class MapKeeper:
             recovered = load_map(entry.path, *self._sizes)
         except InputError as error:
             return None, str(error)
+        # If this mapper crashes before its own first autosave, this one is still that of the mapper just before.
+        with suppress(OSError):
+            entry.path.touch()
         self.unsaved = self._own_autosave = True
         return recovered, f'goes on with {found}, {age_s:.0f} s old, as the last mapper did not end in order'
 

@@ -55,6 +55,19 @@ def test_no_way_to_end_a_mapper_loses_its_map(tmp_path, way, count):
     assert (done.returncode, done.stdout) == (0, ''), done.stderr[-2000:]
 
 
+def test_a_mapper_that_crashes_again_before_its_first_autosave_goes_on_once_more(path):
+    autosaved(keeper_of(path), grown(2))
+    file = map_history.autosave_file(path)
+    for _ in range(3):
+        # It flies for nearly a period, and takes some time to start.
+        aged = file.stat().st_mtime_ns - round(1.2 * AUTOSAVE_S * 1e9)
+        os.utime(path, ns=(aged, aged))
+        os.utime(file, ns=(aged, aged))
+        recovered, note = MapKeeper(path, 0.3, {}).recover(AUTOSAVE_S)
+        assert recovered is not None, note
+        assert recovered.revision == 2
+
+
 def test_an_autosave_is_named_offered_and_taken_up(path, capsys):
     autosaved(keeper_of(path), grown(2))
     # The mapper is killed here, and started again the day after: the map file counts until somebody says otherwise.
