@@ -115,7 +115,7 @@ def _times_of(trajectory: Trajectory, arrivals: Arrivals, shift_ns: int) -> IntA
     """Arrival time of each pose, made non-decreasing; empty if unknown."""
     at = np.searchsorted(arrivals.stamps_ns, trajectory.stamps_ns)
     at = np.clip(at, 0, len(arrivals.stamps_ns) - 1)
-    if np.mean(arrivals.stamps_ns[at] == trajectory.stamps_ns) < 0.99:
+    if not len(at) or np.mean(arrivals.stamps_ns[at] == trajectory.stamps_ns) < 0.99:
         return np.zeros(0, np.int64)
     return np.maximum.accumulate(arrivals.times_ns[at] - shift_ns)
 

@@ -96,6 +96,18 @@ def test_without_truth_or_arrivals_there_is_no_table_of_availability(tmp_path):
     assert available(run_of(tmp_path, fused, markers, output=output, truth=None)) is None
 
 
+def test_a_run_without_poses_of_markers_has_no_table_of_availability(tmp_path):
+    """Nor a warning of numpy on the way: the output is there, fiducial.tum is empty."""
+    fused, markers = straight(200.0), straight(30.0)
+    output = RecordedOutput(
+        fused_arrivals=Arrivals(fused.stamps_ns, fused.stamps_ns),
+        camera_arrivals=Arrivals(markers.stamps_ns, markers.stamps_ns),
+    )
+    nothing = Trajectory(np.zeros(0, np.int64), np.zeros((0, 4, 4)))
+    assert available(run_of(tmp_path, fused, nothing, output=output)) is None
+    assert available(run_of(tmp_path, nothing, markers, output=output)) is None
+
+
 # --- map and markers ---------------------------------------------------------------------------------
 
 
