@@ -1,6 +1,6 @@
 """Node ``landing_target``: pose of the landing pad, for an autopilot behind mavros."""
 
-from collections import OrderedDict
+from collections import deque
 import sys
 from typing import Any
 
@@ -14,13 +14,13 @@ from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import OK, StageNode, WARN
-from thermal_fiducial.ros.frames.landing_pad import for_mavros, pad_in_map, what_lacks
+from thermal_fiducial.ros.frames.landing_pad import for_mavros, needs_no_map, pad_in_map, what_lacks
 from thermal_fiducial.ros.frames.map_corrections import MapCorrections
 from thermal_fiducial.ros.frames.robot_frames import RobotFrames
 from thermal_fiducial.ros.messages import clouds, convert, message_bytes
 from thermal_fiducial.ros.process.run import run
 
-_WAITING = 10  # most frames waiting for their camera pose
+_WAITING = 10  # most frames waiting for their camera pose: a third of a second
 
 
 class LandingTarget(StageNode[LandingTargetConfig]):
@@ -32,8 +32,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
             self.fault('parameter landing_pad: name the markers of the pad')
         self._T_map_pad: FloatArray | None = None
         self._lacking = 'the pad is not in the map'
-        #: stamps of frames that show the pad and wait for their camera pose
-        self._frames: OrderedDict[int, None] = OrderedDict()
+        self._frames: deque[int] = deque(maxlen=_WAITING)  # stamps of those that show the pad, without a pose so far
         self._in_view = False
         self._corrections = MapCorrections()
         self._target = self.advertise(PoseStamped, 'landing_target')
@@ -55,40 +54,41 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         self._in_view = len(seen.ids) > 0
         if not self._in_view:
             return
+        T_camera_pad, alone = seen.branches[0, 0], self._T_map_pad is None or self._stalled
+        if alone and needs_no_map(self.config) and np.isfinite(T_camera_pad).all():
+            self._send_in_body(stamp, T_camera_pad)
         if self._T_map_pad is not None:
-            self._frames[stamp] = None
-            if len(self._frames) > _WAITING:
-                self._frames.popitem(last=False)
-        elif self._needs_no_map and np.isfinite(seen.branches[0, 0]).all():
-            self._send_in_body(stamp, camera_in_body(self.config) @ seen.branches[0, 0])
+            self._frames.append(stamp)
 
     @property
-    def _needs_no_map(self) -> bool:
-        """Whether a single marker's detection gives the pad's pose: one marker, output in the body frame."""
-        return len(self.config.landing_pad) == 1 and self.config.landing_target_frame == 'body'
+    def _stalled(self) -> bool:
+        """Whether frames that show the pad get no camera pose."""
+        return len(self._frames) == _WAITING
 
     def _on_camera_pose(self, message: bytes) -> None:
         pose = self._corrections.in_present_map(message_bytes.camera_pose(message))
         if self._T_map_pad is None or pose.stamp_ns not in self._frames:
             return
-        del self._frames[pose.stamp_ns]
+        while self._frames.popleft() != pose.stamp_ns:  # Those before it have no pose.
+            pass
         if self.config.landing_target_frame == 'body':
-            T_camera_pad = inverse(pose.T_map_camera) @ self._T_map_pad
-            self._send_in_body(pose.stamp_ns, camera_in_body(self.config) @ T_camera_pad)
+            self._send_in_body(pose.stamp_ns, inverse(pose.T_map_camera) @ self._T_map_pad)
         else:
             self._send(pose.stamp_ns, self.config.map_frame, self._T_map_pad)
 
-    def _send_in_body(self, stamp: int, T_body_pad: FloatArray) -> None:
-        self._send(stamp, f'{self.config.base_frame}_rfu', for_mavros(T_body_pad))
+    def _send_in_body(self, stamp: int, T_camera_pad: FloatArray) -> None:
+        self._send(stamp, f'{self.config.base_frame}_rfu', for_mavros(camera_in_body(self.config) @ T_camera_pad))
 
     def _send(self, stamp: int, frame: str, T_frame_pad: FloatArray) -> None:
         self._target.send(PoseStamped(header=convert.header(stamp, frame), pose=convert.pose(T_frame_pad)))
 
     def state(self) -> tuple[bytes, str]:
         """Whether the pad is known and in view."""
-        if self._T_map_pad is None and not self._needs_no_map:
+        if self._T_map_pad is None and not needs_no_map(self.config):
             return WARN, self._lacking
-        return OK, 'ok' if self._in_view else 'the pad is not in view'
+        if not self._in_view:
+            return OK, 'the pad is not in view'
+        return (WARN, 'the pad is in view, but its frames have no camera_pose') if self._stalled else (OK, 'ok')
 
 
 def main() -> int:

@@ -154,6 +154,22 @@ def test_a_pad_of_one_marker_needs_no_map(graph):
     assert graph.diagnose(node)[:2] == (OK, 'ok')
 
 
+@pytest.mark.parametrize('pad', [[7], [7, 8]])
+def test_frames_without_a_camera_pose_are_reported_and_a_pad_of_one_marker_goes_on(graph, pad):
+    """The mapper has ended, say, on the way down: the target came no more, and the node said that it was well."""
+    node = graph.add(LandingTarget, landing_pad=pad, **EXTRINSICS)
+    graph.send('marker_map', marker_map(), profile=qos.LATCHED)
+    for k in range(15):
+        graph.send('markers', markers(7, stamp=STAMP + k))
+    assert graph.diagnose(node)[:2] == (WARN, 'the pad is in view, but its frames have no camera_pose')
+    sent = [convert.stamp_ns(message.header.stamp) - STAMP for message in graph.heard['landing_target']]
+    # Ten frames wait for theirs.
+    assert sent == ([10, 11, 12, 13, 14] if len(pad) == 1 else [])
+    graph.send('camera_pose', camera_pose(STAMP + 12))
+    graph.send('markers', markers(7, stamp=STAMP + 15))
+    assert graph.diagnose(node)[:2] == (OK, 'ok')
+
+
 @pytest.mark.parametrize('quaternion', [(0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0)])
 def test_a_marker_whose_detector_has_no_pose_of_it_is_no_target(graph, quaternion):
     """The autopilot would get numbers that are none."""

@@ -4,6 +4,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from thermal_fiducial.config import LandingTargetConfig
 from thermal_fiducial.core.geometry.se3 import transform
 from thermal_fiducial.core.types import FloatArray
 
@@ -26,6 +27,11 @@ def pad_in_map(T_map_markers: Mapping[int, FloatArray], pad_ids: Sequence[int]) 
     T_map_pad = poses[0].copy()
     T_map_pad[:3, 3] = np.mean([T[:3, 3] for T in poses], axis=0)
     return T_map_pad
+
+
+def needs_no_map(config: LandingTargetConfig) -> bool:
+    """Whether a single marker's detection gives the pad's pose: one marker, output in the body frame."""
+    return len(config.landing_pad) == 1 and config.landing_target_frame == 'body'
 
 
 def what_lacks(pad_ids: Sequence[int], mapped: Collection[int], quarantined: Collection[int]) -> str:
