@@ -22,6 +22,8 @@ _STATUSES = {'fixed': 'black', 'free': 'tab:blue', 'in quarantine': 'tab:red'}
 _ENLARGED = 20.0
 #: Number of labels of four digits that fit into the width of a view.
 _MOST_TICKS = 7
+#: Height of the legend as a share of the drawing: a title and a row.
+_LEGEND = 0.1
 #: Passes of the layout: after three nothing moves by a pixel in drawings of walls, rooms and halls.
 _LAYOUT_STEPS = 3
 
@@ -44,7 +46,9 @@ def plot_map(marker_map: MarkerMap, path: Path, cloud: FloatArray | None = None)
 
 def draw_map(marker_map: MarkerMap, cloud: FloatArray | None = None) -> Figure:
     """The markers with their normals and enlarged ellipses, over a point cloud (N, 3) if there is one."""
-    figure = Figure(figsize=(15, 5.5), layout='constrained')
+    figure = Figure(figsize=(15, 5.5))
+    # A legend 'outside lower center' takes room by itself, but needs matplotlib 3.7; Ubuntu 24.04 has 3.6.
+    figure.set_layout_engine('constrained', rect=(0.0, _LEGEND, 1.0, 1.0 - _LEGEND))
     views = (*_VIEWS, (_front(marker_map), 1, 2))
     for axis, (title, i, j) in zip(figure.subplots(1, len(views)), views, strict=True):
         if cloud is not None:
@@ -59,7 +63,7 @@ def draw_map(marker_map: MarkerMap, cloud: FloatArray | None = None) -> Figure:
             axis.invert_xaxis()  # in a view along x, y points to the left
     handles = [Line2D([], [], color=colour, label=status) for status, colour in _STATUSES.items()]
     title = f'{marker_map.size_in_words}, normals, ellipses of three sigma enlarged {_ENLARGED:g} times'
-    figure.legend(handles=handles, title=title, loc='outside lower center', ncols=len(handles))
+    figure.legend(handles=handles, title=title, loc='lower center', ncols=len(handles))
     # The layout of views of equal scale converges in passes; after the first, a title is cut off.
     for _ in range(_LAYOUT_STEPS):
         figure.draw_without_rendering()

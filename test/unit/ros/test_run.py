@@ -7,6 +7,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 
+import cv2
 import pytest
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.context import Context
@@ -89,7 +90,9 @@ def test_every_parameter_has_a_value_also_an_empty_list():
 def test_a_node_works_on_one_thread_unless_the_user_wants_more():
     program = """
 import thermal_fiducial.nodes.aruco_detector
-import cv2, os, threading
+from thermal_fiducial.ros.process.run import limit_opencv
+import cv2, os
+limit_opencv()
 print(cv2.getNumThreads(), os.environ['OPENBLAS_NUM_THREADS'])
 """
     limits = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENCV_FOR_THREADS_NUM')
@@ -99,6 +102,18 @@ print(cv2.getNumThreads(), os.environ['OPENBLAS_NUM_THREADS'])
             [sys.executable, '-c', program], env=environment, capture_output=True, text=True, timeout=60, check=False
         )
         assert done.stdout.strip() == said, done.stderr
+
+
+def test_an_opencv_that_reads_no_environment_is_limited_too(monkeypatch):
+    before = cv2.getNumThreads()
+    try:
+        for wanted, threads in (('', 1), ('2', 2)):
+            monkeypatch.setenv('OPENCV_FOR_THREADS_NUM', wanted)
+            cv2.setNumThreads(4)
+            run.limit_opencv()
+            assert cv2.getNumThreads() == threads
+    finally:
+        cv2.setNumThreads(before)
 
 
 def set_parameter(graph, name, value):

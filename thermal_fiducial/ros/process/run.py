@@ -35,6 +35,15 @@ def use_transport_profile() -> None:
         os.environ.update(dict.fromkeys(_PROFILE_VARIABLES, str(PROFILE)))
 
 
+def limit_opencv() -> None:
+    """Let OpenCV, if it is loaded, work on one thread, or on as many as the user's ``OPENCV_FOR_THREADS_NUM`` says.
+
+    Where it is built with TBB, as Ubuntu's is, it does not read that variable.
+    """
+    if (opencv := sys.modules.get('cv2')) is not None:
+        opencv.setNumThreads(int(os.environ.get('OPENCV_FOR_THREADS_NUM') or 1))
+
+
 def make_executor(context: Context | None = None) -> Any:
     """EventsExecutor (22 us a callback) if this rclpy has it, else SingleThreadedExecutor (96 us).
 
@@ -96,6 +105,7 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     Exit status: 0 stopped, 2 unusable arguments or parameters, or a map that cannot be saved (one line says which).
     """
     drop_what_does_not_fit()
+    limit_opencv()
     stop = StopSignals(try_shutdown)
     try:
         _make_and_spin(make_node, args, stop)
