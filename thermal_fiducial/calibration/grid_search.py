@@ -68,7 +68,7 @@ class GridSearch:
         index = list(grid.values())
         pixels, weight = grower.pixels[index], float(grower.contrast[index].sum())
         nodes = _facing(np.array(list(grid), dtype=np.int64), pixels)
-        found = board.place(nodes)
+        found = board.place(nodes, grower.contrast[index])
         alike = isinstance(found, GridPlacement) or found.covered > 0
         if isinstance(found, GridPlacement) and weight > self._placed:
             self.placed, self._placed = _points_of(found, pixels), weight

@@ -1,7 +1,7 @@
 """Regular grids among keypoints, grown point by point.
 
-Each point is predicted from its nearest grid points only, so lens distortion, perspective, and contrast that fades or
-reverses over a board do not matter.
+Each point is predicted from its nearest grid points only, and compared with its neighbours only, so lens distortion,
+perspective, and contrast that fades or reverses over a board do not matter.
 """
 
 from collections import Counter
@@ -45,7 +45,7 @@ class Grower:
     ----------
     pixels : (N, 2)
     contrast, signal : (N,)
-    seeds : strongest first
+    seeds : those within a grid first, of these the strongest
     """
 
     def __init__(self, keypoints: Keypoints) -> None:
@@ -56,9 +56,10 @@ class Grower:
         self._scale, self._strength = keypoints.scale, np.log(keypoints.response)
         self._similar = {scale: _similar_scales(keypoints, scale) for scale in np.unique(keypoints.scale).tolist()}
         self._trees = {scale: cKDTree(self.pixels[similar]) for scale, similar in self._similar.items()}
-        self.seeds: list[Seed] = sorted(
-            tuple(seed) for scale in self._similar for seed in self._seeds_of(scale).tolist()
-        )
+        self._tree = cKDTree(self.pixels)
+        seeds = np.concatenate([self._seeds_of(scale) for scale in self._similar] or [np.zeros((0, 5), np.int64)])
+        closed = self._closed_corners(seeds)
+        self.seeds: list[Seed] = [tuple(seeds[row].tolist()) for row in np.lexsort((seeds[:, 0], -closed))]
 
     def _seeds_of(self, scale: int) -> IntArray:
         """Seeds (S, 5) of a search scale, as :data:`Seed`: nearest like neighbours of similar scales on four sides."""
@@ -88,12 +89,26 @@ class Grower:
             [own[row[second]], *(near[row[pair], end[pair]] for pair in (first, second) for end in (one, other))]
         )
 
+    def _closed_corners(self, seeds: IntArray) -> IntArray:
+        """Number (S,) of corners of the square around each seed's centre that have a keypoint: 4 within a board.
+
+        Beside the last row of a board, the second pair of a seed is another row's point and a point of clutter.
+        """
+        closed = np.zeros(len(seeds), dtype=np.int64)
+        centre = self.pixels[seeds[:, 0]]
+        for one, other in product((1, 2), (3, 4)):
+            steps = self.pixels[seeds[:, [one, other]]] - centre[:, None]
+            away, found = self._tree.query(centre + steps.sum(axis=1))
+            like = np.einsum('ni,ni->n', self._hessians[found], self._hessians[seeds[:, 0]]) > _LIKE
+            closed += like & (away < _TOLERANCE * np.linalg.norm(steps, axis=2).min(axis=1))
+        return closed
+
     def total_contrast(self) -> float:
         """Of the seeds."""
         return float(self.contrast[[seed[0] for seed in self.seeds]].sum())
 
     def grids(self) -> Iterator[dict[Node, int]]:
-        """Keypoints (their index) by their place in a grid, strongest seeds first; those of a grid seed no other."""
+        """Keypoints (their index) by their place in a grid, by the order of seeds; those of a grid seed no other."""
         taken: set[int] = set()
         tried = 0
         for seed in self.seeds:
@@ -140,13 +155,12 @@ class Grower:
         asked.update((node, support[node]) for node in places)
         nodes, pixels = np.array(list(grid), dtype=np.float64), self.pixels[list(grid.values())]
         surfaces = local_surfaces(nodes, pixels, np.array(places, dtype=np.float64))
-        scale = int(self._scale[grid[0, 0]])
-        similar, tree = self._similar[scale], self._trees[scale]
         steps, used, before = surfaces.steps, set(grid.values()), len(grid)
         rows = np.flatnonzero(surfaces.determined)
         radii = _TOLERANCE * np.linalg.norm(steps[rows], axis=1).max(axis=1, initial=0.0)
-        for row, nearby in zip(rows.tolist(), tree.query_ball_point(surfaces.centres[rows], radii), strict=True):
-            free = [index for index in similar[nearby].tolist() if index not in used]
+        nearby = self._tree.query_ball_point(surfaces.centres[rows], radii)
+        for row, near in zip(rows.tolist(), nearby, strict=True):
+            free = [index for index in near if index not in used]
             found = self._next(grid, places[row], free, surfaces.centres[row], steps[row]) if free else None
             if found is not None:
                 grid[places[row]] = found[0]
@@ -171,11 +185,12 @@ class Grower:
         return None
 
     def _fits(self, grid: dict[Node, int], node: Node, index: int) -> bool:
-        """Whether Hessian and contrast are like those of a neighbour; of any sign, for contrast may reverse."""
-        neighbours = [grid[n] for n in _around(node, 1) if n in grid]
+        """Whether Hessian, contrast and scale are like those of a neighbour; of any sign, for contrast may reverse."""
+        neighbours = next(known for reach in (1, 2) if (known := [grid[n] for n in _around(node, reach) if n in grid]))
         alike = np.abs(self._hessians[neighbours] @ self._hessians[index]) > _LIKE
         alike &= np.abs(self._strength[neighbours] - self._strength[index]) < np.log(_STRONGER)
-        return len(neighbours) == 0 or bool(alike.any())
+        alike &= np.abs(self._scale[neighbours] - self._scale[index]) <= 1
+        return bool(alike.any())
 
 
 def _similar_scales(keypoints: Keypoints, scale: int) -> IntArray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import FloatArray, IntArray
 
 # A placement is accepted if at least this share of the board is seen, and if every other placement loses at least this
 # share of the points that it would lose of a complete board: a board with a missing row may be shifted by a row.
@@ -69,12 +69,13 @@ class BoardNodes:
         self._views = _views(self._outline)
         self._margin = len(self._outline) - _largest_two(self._overlaps(self._outline))[1]
 
-    def place(self, grid: IntArray) -> GridPlacement | GridRefusal:
+    def place(self, grid: IntArray, contrast: FloatArray | None = None) -> GridPlacement | GridRefusal:
         """Where the board lies in ``grid``.
 
         Parameters
         ----------
         grid : (M, 2) nodes of a grid whose axes have the orientation of the board's, as seen from the front
+        contrast : (M,) of its points; of places with as many points the one with most contrast counts. None: any
         """
         count = len(self._outline)
         if len(grid) < _LEAST_SHARE * count:
@@ -85,7 +86,7 @@ class BoardNodes:
         if most < _LEAST_SHARE * count:
             return GridRefusal(f'a grid of {len(grid)} points that is not like the board')
         unclear = most - second < _CLEAR * self._margin
-        placement = self._best(grid, overlaps)
+        placement = self._best(grid, overlaps if contrast is None else self._weighed(grid, overlaps, contrast))
         # A few extra points belong to another board if all of this one is seen, and are clutter if its border is not.
         if beyond > _BEYOND * count + 1.0 or (unclear and beyond > 0 and most >= (1.0 - _BEYOND) * count):
             return GridRefusal(goes_on(beyond), int(most), placement, another=True)
@@ -117,8 +118,16 @@ class BoardNodes:
 
     def _overlaps(self, grid: IntArray) -> list[FloatArray]:
         """Number of points that each view of the board shares with a grid, for each shift."""
-        occupied = _occupancy(grid)
-        return [_correlation(occupied, _occupancy(view.nodes(self._outline))) for view in self._views]
+        return [np.rint(shared) for shared in self._shared(_occupancy(grid))]
+
+    def _weighed(self, grid: IntArray, overlaps: list[FloatArray], contrast: FloatArray) -> list[FloatArray]:
+        """Overlaps, and less than a point for their share of the contrast: a board's frame is fainter than its rows."""
+        shares = self._shared(_occupancy(grid, 0.9 * contrast / contrast.sum()))
+        return [overlap + share for overlap, share in zip(overlaps, shares, strict=True)]
+
+    def _shared(self, grid: FloatArray) -> list[FloatArray]:
+        """Sum of the values of a ``grid`` at the points of each view of the board, for each shift."""
+        return [_correlation(grid, _occupancy(view.nodes(self._outline))) for view in self._views]
 
 
 def goes_on(beyond: int) -> str:
@@ -155,18 +164,18 @@ def _views(outline: IntArray) -> list[_PlacedView]:
     return list(views.values())
 
 
-def _occupancy(nodes: IntArray) -> FloatArray:
+def _occupancy(nodes: IntArray, values: FloatArray | float = 1.0) -> FloatArray:
+    """Values of the nodes (N, 2), 0 where there is none."""
     nodes = nodes - nodes.min(axis=0)
-    occupied: BoolArray = np.zeros(nodes.max(axis=0) + 1, dtype=np.bool_)
-    occupied[nodes[:, 0], nodes[:, 1]] = True
-    return occupied.astype(np.float64)
+    occupied = np.zeros(nodes.max(axis=0) + 1)
+    occupied[nodes[:, 0], nodes[:, 1]] = values
+    return occupied
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Number of points shared by two occupancies for each shift of ``b`` with any overlap."""
+    """Sum of the values ``a`` at the points of ``b`` for each shift of ``b`` with any overlap, in single precision."""
     around = np.pad(a, [(n - 1, n - 1) for n in b.shape]).astype(np.float32)
-    # Sums of these small numbers are integers up to rounding in single precision.
-    return np.rint(cv2.matchTemplate(around, b.astype(np.float32), cv2.TM_CCORR)).astype(np.float64)
+    return cv2.matchTemplate(around, b.astype(np.float32), cv2.TM_CCORR).astype(np.float64)
 
 
 def _largest_two(overlaps: list[FloatArray]) -> tuple[float, float]:

@@ -44,7 +44,9 @@ def why_refused(image: Float32Array, grid: RefusedGrid | None, board: BoardNodes
         return f'no board found: {cause}; {largest}'
     hindered = _hindrance(image, grid, appearance) or _unlike(image, grid, appearance, len(board.nodes))
     unclear = ', which may lie in more than one place of the board' if grid.refusal.covered else ''
-    return f'{hindered}: {len(grid.nodes)} of {len(board.nodes)} points found{unclear}'
+    found, whole = len(grid.nodes), len(board.nodes)
+    seen = f'{found} of {whole} points found' if found <= whole else f'{found} points in a grid, the board has {whole}'
+    return f'{hindered}: {seen}{unclear}'
 
 
 def why_unlike(image: Float32Array, blur_px: float, nodes: FloatArray, pixels: FloatArray) -> str | None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from thermal_fiducial.calibration.appearance import Appearance
 from thermal_fiducial.calibration.point_fit import fit_points, PointFits, Shared
-from thermal_fiducial.calibration.surface import CLOSELY, local_surfaces, ROUGHLY
+from thermal_fiducial.calibration.surface import CLOSELY, local_surfaces, ROUGHLY, Surfaces
 from thermal_fiducial.calibration.windows import PointWindows, windows_around, with_expected_contrast
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -26,7 +26,8 @@ _LEAST_POINTS = 6
 _SAMPLE, _FEW = 48, 8
 # Most samples, since a width far from the described one takes another window, and relative change that takes none.
 _MOST_SAMPLES, _SAME_WIDTH = 4, 0.05
-# Variance of the residuals, relative to the usual, of points that are fitted again without what deviates.
+# Variance of the residuals, relative to the usual, of points that are fitted again without what deviates: their windows
+# hold something else too, the border of the board or a hand.
 _ODD = 3.0
 # Points and pixels per batch: enough for long rows, few enough for a processor's cache.
 _POINTS_AT_A_TIME, _PIXELS_AT_A_TIME = 160, 30000
@@ -86,8 +87,8 @@ def refine(
     contrast = _Contrast(alike.contrast, np.ones_like(grid) if typical is None else typical)
     refined = _round(image, nodes, pixels, appearance, every, grid, shared, contrast)
     noise = float(np.sqrt(np.nanmedian(refined.variance))) if np.any(np.isfinite(refined.variance)) else 0.0
-    # Points whose windows hold something else too, the border of the board or a hand.
-    if len(odd := np.flatnonzero(refined.variance > _ODD * noise**2)):
+    odd = np.flatnonzero(refined.variance > _ODD * noise**2)
+    if len(odd):
         starts = _next_starts(nodes, pixels, _without(refined.pixels, odd), every, grid)
         again = _round(image, nodes, starts, appearance, odd, grid, shared, contrast, noise)
         for values, new in zip(refined, again, strict=True):
@@ -177,18 +178,41 @@ def _round(
     for first in range(0, len(index), _POINTS_AT_A_TIME):
         part = index[first : first + _POINTS_AT_A_TIME]
         surfaces = local_surfaces(nodes[known], pixels[known], nodes[part], ridge)
-        blur = None if shared is None else np.exp(shared.log_blur[part])
-        windows = windows_around(image, pixels[part], surfaces, appearance.rows(part), blur)
-        if contrast is not None:
-            like = known & contrast.typical
-            windows = with_expected_contrast(windows, nodes[part], nodes[like], contrast.measured[like])
-        for some in _few_pixels(windows):
-            points = part[some.index]
-            common = None if shared is None else Shared(*(values[points] for values in shared))
-            fitted = fit_points(some, common, with_contrast=contrast is not None, noise=noise)
-            for values, new in zip(fits, fitted, strict=True):
-                values[points] = new
+        for rows in _alike_in_size(surfaces):
+            some = part[rows]
+            blur = None if shared is None else np.exp(shared.log_blur[some])
+            windows = windows_around(image, pixels[some], surfaces.rows(rows), appearance.rows(some), blur)
+            if contrast is not None:
+                like = known & contrast.typical
+                windows = with_expected_contrast(windows, nodes[some], nodes[like], contrast.measured[like])
+            _fit_into(fits, some, windows, shared, with_contrast=contrast is not None, noise=noise)
     return fits
+
+
+def _fit_into(
+    fits: PointFits,
+    points: IntArray,
+    windows: PointWindows,
+    shared: Shared | None,
+    *,
+    with_contrast: bool,
+    noise: float | None,
+) -> None:
+    """Fit ``points`` in their windows, and write them into the ``fits`` of all."""
+    for batch in _few_pixels(windows):
+        index = points[batch.index]
+        common = None if shared is None else Shared(*(values[index] for values in shared))
+        fitted = fit_points(batch, common, with_contrast=with_contrast, noise=noise)
+        for values, new in zip(fits, fitted, strict=True):
+            values[index] = new
+
+
+def _alike_in_size(surfaces: Surfaces) -> list[IntArray]:
+    """Rows of points in batches with windows of similar size, as each window takes the room of the largest."""
+    area = np.abs(surfaces.steps).sum(axis=2).prod(axis=1)
+    order = np.argsort(area, kind='stable')
+    batch = np.cumsum(area[order]) // _PIXELS_AT_A_TIME
+    return np.split(order, np.flatnonzero(np.diff(batch)) + 1)
 
 
 def _few_pixels(windows: PointWindows) -> Iterator[PointWindows]:
