@@ -91,7 +91,7 @@ class MarkerDetector:
         if T_camera_map is not None and len(known.ids) and config.guided:
             expected = known.expected(T_camera_map, camera, config.min_side_px)
         found, history = self._finder.find(frame, history, known, expected, config)
-        refined = refine(frame, found, history.track, self._decoder, config)
+        refined, scale = refine(frame, found, history.track, history.gray_scale, self._decoder, config)
         refined = confirmed(frame, found, refined, self._decoder, config)
         ids, corners = refined.ids, refined.corners
         at = refined.places.at.at_pixels(corners.corners_px)
@@ -106,7 +106,7 @@ class MarkerDetector:
         twist = refined.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], known.sizes[ids])
         markers = ExpectedMarkers(ids, refined.places.at.x, depth, corners.contrast / frame.noise)
-        self._history = history.after(stamp_ns, twist, markers, saw_partial=len(rows) > len(ids))
+        self._history = history.after(stamp_ns, twist, markers, scale, saw_partial=len(rows) > len(ids))
         return rows
 
     def _poses(

@@ -97,15 +97,15 @@ def test_what_a_display_displaces_the_pattern_shows(frames, bent):
     assert nees < 2.0
 
 
-@pytest.mark.parametrize(('bent', 'allowed'), [(0.35, 0.03), (3.0, 0.08)])
-def test_what_a_display_does_to_motion_blur_patterns_show(bent, allowed):
+@pytest.mark.parametrize(('bent', 'allowed'), [(0.35, 0.019), (1.0, 0.021), (2.0, 0.03), (3.0, 0.055)])
+def test_what_a_display_does_to_motion_blur_is_undone(bent, allowed):
     """In 2 px of it, black takes longer to give way to white than white to black, or the other way round."""
     frames = list(render_frames('fast', seconds=20.0, seed=5, start=440, stop=444))
     rows = last_rows(frames, lambda counts: displayed(counts, bent), 'fast')
     error = corners_px(rows) - np.stack([frames[-1].corners_px[marker_id] for marker_id in rows['id'].tolist()])
     shape = error - error.mean(axis=1, keepdims=True)
-    # 0.020 and 0.064 px when this was written; without the lag tails, taken from gray levels, 0.026 and 0.105, by the
-    # width of borders 0.043 and 0.103.
+    # 0.018, 0.019, 0.024 and 0.048 px when this was written; with lag tails in the patterns 0.020, 0.024, 0.039 and
+    # 0.065.
     assert np.sqrt(np.mean(shape**2)) < allowed
 
 

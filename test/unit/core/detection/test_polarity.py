@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from thermal_fiducial.core.detection.corners.gray_scale import UNKNOWN_SCALE
 from thermal_fiducial.core.detection.finding.finder import FrameHistory
 from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
@@ -16,7 +17,7 @@ def seen(*frames):
     for index, cnr in enumerate(frames):
         count = len(cnr)
         markers = ExpectedMarkers(np.arange(count), np.zeros((count, 4, 2)), np.ones((count, 4)), np.array(cnr))
-        history = history.after(index * 33_333_333, None, markers, saw_partial=False)
+        history = history.after(index * 33_333_333, None, markers, UNKNOWN_SCALE, saw_partial=False)
     return history
 
 
@@ -51,7 +52,7 @@ def test_kinds_are_forgotten_when_none_is_seen(count):
 
 def test_stamps_that_go_back_forget_nothing():
     history = seen(*[[3.0]] * 100)
-    history = history.after(0, None, ExpectedMarkers.none(), saw_partial=False)
+    history = history.after(0, None, ExpectedMarkers.none(), UNKNOWN_SCALE, saw_partial=False)
     assert history.polarities('alike') == (1.0,)
 
 

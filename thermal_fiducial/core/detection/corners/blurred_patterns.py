@@ -2,8 +2,8 @@
 
 A pattern is sampled on a grid in the marker's own coordinates [cells], where cells are separable: the blur of its
 columns and that of its rows are products. A blur that is oblique there, as that of a tilted marker and of motion, has a
-correlation c besides, and a Gaussian with it is exp(c d2/dxdy) of one without. Bolometers forget exponentially: the
-pattern lags behind by an age that is a mixture of Gaussians.
+correlation c besides, and a Gaussian with it is exp(c d2/dxdy) of one without. Bolometers forget exponentially: where
+lag tails are not removed, the pattern lags behind by an age that is a mixture of Gaussians.
 
 Straight lines are bent by the lens: between its corners a marker is displaced by a cubic polynomial of the places in
 it.
@@ -11,7 +11,7 @@ it.
 All that is linear is part of the model. The warm surface and the sheet before it each have a temperature that is linear
 across the marker, so level and contrast are. The surface may be warmest in its middle, and may end one cell outside the
 marker; and smoke in front makes the level a little quadratic. The gray levels of a display are a polynomial of fourth
-order of the counts, blur, lag and all.
+order of the blurred counts.
 """
 
 from functools import cache
@@ -46,8 +46,8 @@ _FARTHEST = 6.0
 _Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
 _BELOW = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z.tolist()])
 # Ages of an exponential response in four parts, up to 0.6 time constants, up to 1.4, up to 2.8, and older: what they
-# weigh, and mean and variance in time constants. With two parts, markers in 2 to 5 px of lag are 1.1 to 2.6 times as
-# far off; with three they are as with four or 10 % farther, with five or more as with four.
+# weigh, and mean and variance in time constants. Fitted with two parts, markers in 2 to 5 px of lag were 1.1 to 2.6
+# times as far off; with three they were as with four or 10 % farther, with five or more as with four.
 _LASTS = np.array([0.6, 0.8, 1.4, 40.0])
 _BEGINS = np.cumsum(_LASTS) - _LASTS
 _WEIGHTS = np.exp(-_BEGINS) * -np.expm1(-_LASTS)
@@ -108,6 +108,11 @@ class PatternGrid(NamedTuple):
         """Values (..., n * n, P / (n * n)) of samples (..., P)."""
         return values.reshape(*values.shape[:-1], -1, self.density**2)
 
+    def apart_px(self, to_cells: FloatArray) -> FloatArray:
+        """Distance (Q,) of samples [px], ``to_cells`` (Q, 2, 2) of :func:`cells_by_pixels`."""
+        (xu, xv), (yu, yv) = np.moveaxis(to_cells, 0, -1)
+        return np.asarray(self.apart / np.sqrt(np.abs(xu * yv - xv * yu)))
+
 
 @cache
 def pattern_grid(cells: int, density: int, nearer: int = 0, *, bent: bool = False) -> PatternGrid:
@@ -161,7 +166,7 @@ class PatternView(NamedTuple):
         parts = {name: getattr(self, name) for name in names}
         return self._replace(**{name: part[which] for name, part in parts.items() if part is not None})
 
-    def gray(self, quads: FloatArray, grid: PatternGrid) -> Float32Array:
+    def values(self, quads: FloatArray, grid: PatternGrid) -> Float32Array:
         """Values (Q, P) at the samples of markers in ``quads`` (Q, 4, 2)."""
         places = seen_between(quads, grid.weights)
         if self.bends is not None:
@@ -171,8 +176,7 @@ class PatternView(NamedTuple):
             maps = self.to_tails.transpose(1, 2, 0)[..., None].astype(np.float32)
             tails = maps[:, 0] * places[0] + maps[:, 1] * places[1] + maps[:, 2]
             shown = without_tails(shown, self._at(tails))
-        # Small numbers for sums in single precision.
-        return np.asarray(shown - shown[:, :1])
+        return shown
 
     def _at(self, places: Float32Array) -> Float32Array:
         u, v = places

@@ -69,6 +69,13 @@ class Unevenness(Stacked):
         shares = (1.0 - np.sqrt(noise / (noise + part)) for part in (of_level, of_contrast))
         return Unevenness(unit, *(part.astype(np.float32) for part in (*shares, more)))
 
+    def left(self, rest: Float32Array) -> Float32Array:
+        """What the differences that residuals (Q, n * n, P / (n * n)) show leave of these."""
+        level, contrast = (1.0 - (1.0 - share) ** 2 for share in (self.of_level, self.of_contrast))
+        of_pattern = contrast * (rest * self.pattern).sum(axis=2)
+        shown = (level * rest.mean(axis=2))[..., None] + of_pattern[..., None] * self.pattern
+        return np.asarray(rest - shown, dtype=np.float32)
+
     def whitened(self, values: Float32Array) -> Float32Array:
         """Values (Q, K, P) at the samples, whitened."""
         count, patches, size = self.pattern.shape
@@ -110,11 +117,11 @@ class PatternResiduals(Stacked):
 
     def sampled_at(self, view: PatternView, quads: FloatArray, which: IntArray) -> 'PatternResiduals':
         """The same with ``which`` (W,) at corners ``quads`` (W, 4, 2) so near that the patterns on them stay."""
-        samples = self.grid.without_background(view.only(which).gray(quads, self.grid))
+        samples = _samples(view.only(which), quads, self.grid)
         whitened = samples
         if self.unevenness is not None:
             whitened = self.unevenness.only(which).whitened(samples[:, None])[:, 0]
-        amounts, rest = _fitted(-self.J[which, LINEAR], whitened)
+        amounts, rest = fitted(-self.J[which, LINEAR], whitened)
         return replace(
             self,
             corners_px=changed(self.corners_px, which, quads),
@@ -135,7 +142,7 @@ class PatternResiduals(Stacked):
     @property
     def pixels(self) -> FloatArray:
         """Pixels (Q,) that the samples cover."""
-        return np.asarray(self.samples.shape[1] * _apart_px(self.grid, self.to_cells) ** 2)
+        return np.asarray(self.samples.shape[1] * self.grid.apart_px(self.to_cells) ** 2)
 
 
 def linearised(
@@ -148,14 +155,14 @@ def linearised(
     """The fit of ``white`` cells (Q, m, m), seen with ``blur`` (Q,) [px], at corners ``quads`` (Q, 4, 2)."""
     to_cells = cells_by_pixels(quads, white.shape[1])
     model, spread = blurred(view, to_cells, blur, white, grid)
-    samples = grid.without_background(view.gray(quads, grid))
+    samples = _samples(view, quads, grid)
     terms = linear_terms(model, spread, grid, white.shape[1], displayed=view.displayed)
     terms = grid.without_background(terms)
-    amounts, rest = _fitted(terms, samples)
+    amounts, rest = fitted(terms, samples)
     contrast = local_contrast(amounts.astype(np.float32), model, grid, displayed=view.displayed)
     uneven = None
     if view.displayed:
-        uneven = Unevenness.shown(grid.patches(model.value), grid.patches(rest), _apart_px(grid, to_cells))
+        uneven = Unevenness.shown(grid.patches(model.value), grid.patches(rest), grid.apart_px(to_cells))
         contrast = (grid.patches(contrast) + uneven.more_contrast[..., None]).reshape(rest.shape)
         whole, sign = np.abs(amounts[:, :1]), np.sign(amounts[:, :1])
         contrast = (sign * np.maximum(sign * contrast, _LEAST_CONTRAST * whole)).astype(np.float32)
@@ -169,17 +176,18 @@ def linearised(
     J[:, LINEAR] = -terms
     if uneven is not None:
         J = uneven.whitened(J)
-        amounts, rest = _fitted(-J[:, LINEAR], uneven.whitened(samples[:, None])[:, 0])
+        amounts, rest = fitted(-J[:, LINEAR], uneven.whitened(samples[:, None])[:, 0])
     return PatternResiduals(quads, blur, to_cells, spread, samples, rest, amounts, J, grid, uneven)
 
 
-def _apart_px(grid: PatternGrid, to_cells: FloatArray) -> FloatArray:
-    """Distance (Q,) of samples [px], ``to_cells`` (Q, 2, 2) of :func:`cells_by_pixels`."""
-    (xu, xv), (yu, yv) = np.moveaxis(to_cells, 0, -1)
-    return np.asarray(grid.apart / np.sqrt(np.abs(xu * yv - xv * yu)))
+def _samples(view: PatternView, quads: FloatArray, grid: PatternGrid) -> Float32Array:
+    """Values (Q, P) at the samples of markers in ``quads`` (Q, 4, 2), without their background."""
+    values = view.values(quads, grid)
+    # Small numbers for sums in single precision.
+    return grid.without_background(values - values[:, :1])
 
 
-def _fitted(terms: Float32Array, samples: Float32Array) -> tuple[FloatArray, Float32Array]:
+def fitted(terms: Float32Array, samples: Float32Array) -> tuple[FloatArray, Float32Array]:
     """Amounts (Q, L) of linear terms (Q, L, P) in gray levels (Q, P), and what they leave of these."""
     products = np.asarray(terms @ terms.swapaxes(1, 2), dtype=np.float64) + TINY * np.eye(terms.shape[1])
     amounts = np.linalg.solve(products, terms @ samples[..., None])

@@ -7,7 +7,9 @@ repeated.
 
 Corners are those of the fitted sides (:mod:`side_fit`), or of the whole pattern where cells are narrow for their blur,
 and in pictures for a display (:mod:`pattern_fit`). A gain control for displays is a nonlinear function of the counts:
-all dark regions grow, or all shrink, and only the whole pattern shows by how much.
+all dark regions grow, or all shrink, and only the whole pattern shows by how much. Before lag tails are removed, it is
+undone as far as it is known (:mod:`gray_scale`); the markers then show it better, and if that changes it much, the
+refinement is repeated as well.
 """
 
 from dataclasses import dataclass, replace
@@ -17,6 +19,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.blurred_patterns import lens_bends, PatternView
 from thermal_fiducial.core.detection.corners.corner_errors import of_motion_blur, unknown_motion
+from thermal_fiducial.core.detection.corners.gray_scale import GrayScale
 from thermal_fiducial.core.detection.corners.pattern_fit import fitted_patterns, nearness, too_blurred_for_sides
 from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.corners.side_fit import OF_CLEAR, OF_FAINT, refine_corners
@@ -38,15 +41,11 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
 
 #: Contrast-to-noise ratio above which a marker is clear: it is found at full and at half resolution.
 CLEAR_CNR = 20.0
-# Displacement by lag up to which patterns in pictures for a display have none [px]: a fortieth of the variance of blur.
-_LAG_THAT_SHOWS_PX = 0.1
-# Displacement by lag from which on lag tails are removed from gray levels, too [cells]. With 0.6, markers of 40 px
-# behind a steep plateau equalisation are 0.20 instead of 0.13 px off in more than 2 px of lag; with 1, markers of 45 px
-# behind one that is nearly linear are 0.2 instead of 0.1 px off in 6 to 8 px.
-_LONG_LAG_CELLS = 0.75
 # Change of the displacement by lag below which the refinement is not repeated [px].
 _BLUR_THAT_MATTERS_PX = 0.4
-_ROUNDS = 2
+# Number of refinements, and of those where a gray scale is to be found as well: with 2, markers of 40 px behind a
+# plateau equalisation that was not known before are 0.13 instead of 0.06 px off.
+_ROUNDS, _ROUNDS_ON_DISPLAYS = 2, 4
 _EYE = np.eye(2)
 
 
@@ -77,31 +76,52 @@ def refine(
     frame: Frame,
     found: FoundMarkers,
     track: MotionTrack,
+    scale: GrayScale,
     decoder: Decoder,
     config: ArucoDetectorConfig,
-) -> RefinedMarkers:
-    """Corners of N markers.
+) -> tuple[RefinedMarkers, GrayScale]:
+    """Corners of N markers, and the gray scale of the display as it is known then.
 
     Parameters
     ----------
     track : motion and markers of the last frame, which with the corners give the twist
+    scale : of the display, as far as it is known; counts have none
     decoder : of the dictionary
     """
     if len(found.ids) == 0:
-        return RefinedMarkers.none(frame)
+        return RefinedMarkers.none(frame), scale
     clear = np.abs(found.cnr).min() > CLEAR_CNR
     columns = OF_CLEAR if clear else OF_FAINT
     twist, places = frame.twist, found.places
-    for _ in range(_ROUNDS):
-        blur = motion_blur(frame, places, twist)
+    for _ in range(_ROUNDS_ON_DISPLAYS if frame.displayed else _ROUNDS):
+        blur, before = motion_blur(frame, places, twist), scale
         start = places.at.at_pixels(places.at.px + blur.shift)
-        refined = _measured(frame, found, start, blur, columns, decoder, config)
+        bent = frame.displayed and blur.to_tails is not None
+        shown = frame.in_counts(scale.counts) if bent else frame
+        refined = _measured(shown, found, start, blur, columns, decoder, config)
         markers = _at_stamp(frame, found.ids, places, blur, refined, twist, track, decoder.cells)
+        if bent:
+            scale = _shown_scale(frame, scale, markers, start, decoder, config)
         change = np.abs(markers.corners.corners_px - refined.corners_px + blur.shift)
-        if markers.twist is None or change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX:
+        settled = change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX and not scale.differs(before)
+        if markers.twist is None or settled:
             break
         twist, places = markers.twist, markers.places
-    return markers
+    return markers, scale
+
+
+def _shown_scale(
+    frame: Frame,
+    before: GrayScale,
+    markers: RefinedMarkers,
+    start: ImagePoints,
+    decoder: Decoder,
+    config: ArucoDetectorConfig,
+) -> GrayScale:
+    """The gray scale of the display that markers show, which were looked for at ``start`` (N, 4)."""
+    view = PatternView(frame.image, lag=markers.blur.lag, bends=lens_bends(start, frame.camera))
+    corners = markers.observed.corners_px + markers.blur.removed
+    return before.shown_by(view, corners, markers.ids, decoder, config.blur_px)
 
 
 def _measured(
@@ -138,42 +158,23 @@ def _by_patterns(
     decoder: Decoder,
     config: ArucoDetectorConfig,
 ) -> RefinedCorners:
-    """Corners of N markers by their whole patterns, with lag tails where ``_with_lag_tails``."""
-    lagging = _with_lag_tails(frame, start, blur, decoder.cells)
-    kept = np.where(lagging[:, None, None], blur.removed, 0.0)
-    start = start.at_pixels(start.px + kept)
-    spread = np.where(lagging[:, None], blur.lag.mean(axis=1), blur.spread)
-    # Each group is sampled and blurred alike.
-    near = nearness(start.px, decoder.cells, np.hypot(config.blur_px, np.hypot(*spread.T)))
-    groups, refined = 2 * near + lagging, RefinedCorners.none()
-    for group in np.unique(groups):
-        which = groups == group
+    """Corners of N markers by their whole patterns."""
+    # Each group is sampled alike.
+    near = nearness(start.px, decoder.cells, np.hypot(config.blur_px, np.hypot(*blur.spread.T)))
+    refined = RefinedCorners.none()
+    for nearer in np.unique(near):
+        which = near == nearer
         there, moving = start.only(which), blur.only(which)
-        view = PatternView(frame.image, displayed=frame.displayed, bends=lens_bends(there, frame.camera))
-        if group % 2:
-            view = view._replace(lag=moving.lag)
-        else:
-            view = view._replace(to_tails=moving.to_tails, motion=moving.spread)
-        fitted = fitted_patterns(frame, found.only(which), there, view, group // 2, decoder, config.blur_px)
+        bends = lens_bends(there, frame.camera)
+        view = PatternView(frame.image, moving.to_tails, moving.spread, displayed=frame.displayed, bends=bends)
+        fitted = fitted_patterns(frame, found.only(which), there, view, nearer, decoder, config.blur_px)
         refined = refined.joined(fitted)
-    refined = refined.only(_places(groups))
-    return replace(refined, corners_px=refined.corners_px - kept)
+    return refined.only(_places(near))
 
 
 def _places(groups: BoolArray | IntArray) -> IntArray:
     """Where each of N items of some ``groups`` (N,) is in a batch that has these one after the other, (N,)."""
     return np.argsort(np.argsort(groups, kind='stable'))
-
-
-def _with_lag_tails(frame: Frame, start: ImagePoints, blur: MotionBlur, cells: int) -> BoolArray:
-    """Of which markers (N,) lag tails are part of the pattern: in pictures for a display, whose scale bends them.
-
-    Where the lag is long, patterns with tails are worse than those of gray levels from which tails are removed, as if
-    these were counts.
-    """
-    lag_px = np.hypot(*blur.lag.mean(axis=1).T)
-    shows = frame.displayed and lag_px.max(initial=0.0) > _LAG_THAT_SHOWS_PX
-    return np.asarray(shows & (lag_px < _LONG_LAG_CELLS / cells * sides_px(start.px)))
 
 
 def _at_stamp(
@@ -208,7 +209,7 @@ def _at_stamp(
     lag_blur = places.lag_blur(twist, frame.lag)
     rolling = rolling_displacement(places, twist, frame, (refined.corners_px + blur.removed)[..., 1])
     px = refined.corners_px - lag_blur + blur.removed - rolling
-    unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur, displayed=frame.displayed)
+    unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur)
     if frame.twist is None:
         unknown = unknown + _of_unpredicted_motion(frame, places, refined, twist, cells)
     corners = replace(refined, corners_px=px, covariances=doubted + unknown)

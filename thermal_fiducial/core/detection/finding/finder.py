@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.corners.gray_scale import GrayScale, UNKNOWN_SCALE
 from thermal_fiducial.core.detection.corners.refining import CLEAR_CNR
 from thermal_fiducial.core.detection.finding.search import BlindSearch, SearchScales
 from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
@@ -56,14 +57,16 @@ class FrameHistory:
     #: stamp of the last frame that was searched blindly, and the resolutions that were used
     searched_ns: int | None = None
     scales: SearchScales = SearchScales.ALL
+    #: of the display, as far as it is known
+    gray_scale: GrayScale = UNKNOWN_SCALE
 
     def after(
-        self, stamp_ns: int, twist: Twist | None, markers: ExpectedMarkers, *, saw_partial: bool
+        self, stamp_ns: int, twist: Twist | None, markers: ExpectedMarkers, gray_scale: GrayScale, *, saw_partial: bool
     ) -> 'FrameHistory':
-        """The history that the frame after one with this twist and these markers starts from."""
+        """The history that the frame after one with these starts from."""
         track = self.track.after(stamp_ns, twist, markers)
         balance = self._balance_after(stamp_ns, float(np.sign(markers.cnr).sum()))
-        return FrameHistory(track, balance, saw_partial, self.searched_ns, self.scales)
+        return FrameHistory(track, balance, saw_partial, self.searched_ns, self.scales, gray_scale)
 
     def _balance_after(self, stamp_ns: int, surplus: float) -> float:
         """The balance after a frame with a ``surplus`` of dark over bright markers."""

@@ -16,7 +16,7 @@ With an acceleration a, the image of s ago lies s w - s^2 a / 2 behind. The mean
 of tau + m / 2 ago.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import cv2
@@ -71,6 +71,9 @@ class Frame:
     readout: float
     #: whether it is a picture for a display, whose gain control is a nonlinear function of the counts
     displayed: bool = False
+    #: (height, width) as received, and whether the fixed pattern of its columns is removed from ``image``
+    received: Counts | Gray | None = None
+    corrected: bool = False
 
     @staticmethod
     def of(
@@ -86,9 +89,22 @@ class Frame:
         noise, displayed = pixel_noise(counts), bool(counts[::_ROW_STEP].max() < _LEVELS)
         lag, readout = config.bolometer_lag, config.readout_time
         image = counts.astype(np.float32)
-        if counts.dtype != np.uint8 and not keep_columns:
+        corrected = counts.dtype != np.uint8 and not keep_columns
+        if corrected:
             image = with_columns_corrected(image, noise)
-        return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed)
+        return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed, counts, corrected)
+
+    def in_counts(self, counts_of_levels: FloatArray) -> 'Frame':
+        """The frame with counts for the gray levels of a picture for a display, by those (256,) of each level.
+
+        Columns differ by an offset of counts, which the scale bends.
+        """
+        assert self.received is not None
+        image = counts_of_levels.astype(np.float32).take(self.received, mode='clip')
+        noise = pixel_noise(image)
+        if self.corrected:
+            image = with_columns_corrected(image, noise)
+        return replace(self, image=image, noise=noise)
 
 
 @dataclass(frozen=True, slots=True)
