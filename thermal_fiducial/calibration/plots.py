@@ -140,6 +140,8 @@ def _spread(residuals: FloatArray) -> str:
     figure, axes = _figure('residuals of all points')
     axes.plot(residuals[:, 0], residuals[:, 1], '.', markersize=2, rasterized=True)
     axes.set(xlabel='u [px]', ylabel='v [px]', aspect='equal')
+    # Numbers of three digits run into each other where there are more.
+    axes.locator_params(nbins=5)
     return _html(figure, 'residuals of all points')
 
 
