@@ -18,6 +18,8 @@ from thermal_fiducial.report.landing_check import check_landing
 if TYPE_CHECKING:
     from thermal_fiducial.ros.watching.bridge_listener import Links
 
+#: Exit status without a fault, but with live checks that lacked their motion.
+NOT_TESTED = 3
 _WIDTH = 118
 
 
@@ -27,7 +29,8 @@ def add_arguments(parser: Parser) -> None:
         'Verify rate, stamps, frames (gravity of a still drone, a yaw turn), velocity and covariance of what a flight '
         'controller would receive, and the landing target where there is one, and say what it would do with it. '
         'Without RECORDING it listens: keep the drone still for some seconds, then turn it by hand to the left and '
-        'back, and carry it about. Exit status 1 if there is a fault.'
+        'back, and carry it about. Exit status 1 if there is a fault, '
+        '3 if there is none but a live check was not tested.'
     )
     parser.add_argument('recording', nargs='?', type=Path, metavar='RECORDING', help='bag or run folder; none: listen')
     parser.add_argument('--topic', default='', help='odometry to check (default: what pose_ekf sends, as remapped)')
@@ -42,7 +45,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check and print the findings; returns 1 if an autopilot would reject the odometry, else 0."""
+    """Check and print the findings; returns :func:`exit_status`."""
     findings: list[Finding] = []
     if args.recording is not None:
         record = read_bridge(args.recording, args.topic, args.imu)
@@ -56,7 +59,19 @@ def run(args: argparse.Namespace) -> int:
         print('What a flight controller would receive:')
         for finding in findings:
             print(_line(finding))
-    return int(any(finding.level is Level.FAULT for finding in findings))
+    return exit_status(findings, live=args.recording is None)
+
+
+def exit_status(findings: list[Finding], *, live: bool) -> int:
+    """1 if an autopilot would reject the odometry, :data:`NOT_TESTED` if that is not known of a ``live`` one, else 0.
+
+    A script that arms on 0 must not do so for a drone that nobody has turned. A recording cannot be repeated, and its
+    stamps have no age.
+    """
+    levels = {finding.level for finding in findings}
+    if Level.FAULT in levels:
+        return 1
+    return NOT_TESTED if live and Level.UNTESTED in levels else 0
 
 
 def _line(finding: Finding) -> str:

@@ -12,10 +12,11 @@ from rosbags.typesys import get_typestore, Stores
 from support.commands import status
 from support.flights import Motion
 
+from thermal_fiducial.cli.check_bridge import exit_status
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, so3_exp
 from thermal_fiducial.files.bag_writer import BagWriter
-from thermal_fiducial.report.bridge_check import check_bridge, Level
+from thermal_fiducial.report.bridge_check import check_bridge, Finding, Level
 from thermal_fiducial.report.bridge_record import BridgeRecord, BridgeRecorder
 
 RATE = 40.0
@@ -214,6 +215,16 @@ def test_a_recorded_run_is_checked(tmp_path, flying, capsys):
     assert findings['yaw']['level'] == 'ok'
     assert findings['gravity']['level'] == 'not tested'
     assert main(['check-bridge', str(tmp_path), '--topic', 'nothing']) == 2
+
+
+@pytest.mark.parametrize(
+    ('levels', 'live', 'recorded'),
+    [((), 0, 0), ((Level.WARNING,), 0, 0), ((Level.UNTESTED,), 3, 0), ((Level.UNTESTED, Level.FAULT), 1, 1)],
+)
+def test_a_live_check_that_lacked_its_motion_is_no_pass(levels, live, recorded):
+    findings = [Finding('a check', level, '', '') for level in (Level.OK, *levels)]
+    assert exit_status(findings, live=True) == live
+    assert exit_status(findings, live=False) == recorded
 
 
 def test_listening_needs_no_optional_package_and_takes_ros_arguments():
