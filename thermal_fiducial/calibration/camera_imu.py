@@ -23,6 +23,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 
 _LEAST_POSES = 100
@@ -200,7 +201,7 @@ class _RigRecording:
         inside = (stamps > self.imu.seconds[0] + margin) & (stamps < self.imu.seconds[-1] - margin)
         inside[1:] &= np.diff(stamps) > 1e-4
         if inside.sum() < _LEAST_POSES:
-            count = f'{inside.sum()} camera poses with IMU samples around them'
+            count = f'{number_of(int(inside.sum()), "camera pose")} with IMU samples around them'
             raise InputError(f'{count}: {_LEAST_POSES} or more are needed')
         return np.asarray(inside)
 

@@ -14,6 +14,7 @@ from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, MODELS
 from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 
 #: Fewest views: a camera can still be fitted without one of them.
@@ -96,7 +97,7 @@ def calibrate(
         Too few views, or views from which no camera follows.
     """
     if len(sightings) < LEAST_VIEWS:
-        raise InputError(f'{len(sightings)} views of the board: a calibration needs {LEAST_VIEWS} or more')
+        raise InputError(f'{number_of(len(sightings), "view")} of the board: a calibration needs {LEAST_VIEWS} or more')
     camera = _start(sightings, width, height, model, focal_px)
     T = np.stack([board_pose(sighting, camera) for sighting in sightings])
     return calibrate_from(sightings, camera, T, radius=radius, free=free)

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.wording import number_of
 
 # A placement is accepted if at least this share of the board is seen, and if every other placement loses at least this
 # share of the points that it would lose of a complete board: a board with a missing row may be shifted by a row.
@@ -132,7 +133,7 @@ class BoardNodes:
 
 def goes_on(beyond: int) -> str:
     """Reason to refuse a grid with points ``beyond`` the board."""
-    return f'the grid goes on beyond the one described: {beyond} more points'
+    return f'the grid goes on beyond the one described: {number_of(beyond, "more point")}'
 
 
 @dataclass(frozen=True)

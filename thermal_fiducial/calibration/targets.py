@@ -15,6 +15,7 @@ from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 
 _APART_NS = 10_000_000_000
@@ -180,7 +181,7 @@ class MarkerBoard:
         rows = self._detector.detect(self._stamp_ns, counts, camera)
         rows = rows[np.isin(rows['id'], list(self._board.markers))]
         if len(rows) < 2:
-            raise BoardNotFound(f'{len(rows)} markers of the board, of which two are needed')
+            raise BoardNotFound(f'{number_of(len(rows), "marker")} of the board, of which two are needed')
         markers = [self._board.markers[marker_id] for marker_id in rows['id'].tolist()]
         T = np.stack([marker.T_map_marker for marker in markers])
         points = corners_in_map(T, np.array([marker.size for marker in markers]))

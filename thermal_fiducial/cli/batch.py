@@ -8,6 +8,7 @@ from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import PROCESSES
 from thermal_fiducial.cli.subcommands import add_remap, whole_number
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import parse_remaps
 
@@ -66,9 +67,9 @@ def run(args: argparse.Namespace) -> int:
     count = min(args.workers, len(args.bags))
     with batch.cleared_up(), workers(count, args.scheduler) as client, progress_bar('batch') as progress:
         summary = run_batch(batch, camera, client, progress, _warn)
-    runs = '1 run' if len(summary['runs']) == 1 else f'{len(summary["runs"])} runs'
+    runs = number_of(len(summary['runs']), 'run')
     print(
-        f'{args.out}: {runs}; {len(summary["markers"])} markers in the joint map, '
+        f'{args.out}: {runs}; {number_of(len(summary["markers"]), "marker")} in the joint map, '
         f'{summary["frames_used"]} of {summary["frames"]} frames used'
     )
     return 0

@@ -3,12 +3,14 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.ranges import CORNER_PX, LATE_S, SIDE_M
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import STORAGES
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -74,8 +76,9 @@ def run(args: argparse.Namespace) -> int:
     with made_whole(args.out) as folder, progress_bar(f'import {args.folder.name}') as share:
         advance = counted(share, max(frames, 1))
         write_recording(folder, recording, args.sigma_px or _SIGMA_PX, args.late, args.storage, advance)
+    bag, params = (quote(str(path)) for path in (args.out, args.out / 'params.yaml'))
     print(
-        f'{args.out}: {len(recording.samples)} IMU samples, {frames} frames\n'
-        f'replay it with: thermal-fiducial replay {args.out} --params {args.out}/params.yaml --map MAP --out RUN'
+        f'{args.out}: {number_of(len(recording.samples), "IMU sample")}, {number_of(frames, "frame")}\n'
+        f'replay it with: thermal-fiducial replay {bag} --params {params} --map MAP --out RUN'
     )
     return 0

@@ -269,13 +269,13 @@ def _survey(path: Path) -> dict[int, FloatArray]:
 
 def _history(args: argparse.Namespace) -> int:
     for entry in map_history.entries(args.map):
-        what = entry.problem or f'revision {entry.revision}, {entry.markers} markers, before: {entry.action}'
+        what = entry.problem or f'{entry.content}, before: {entry.action}'
         print(f'{entry.number:6d}  {what}')
     current = _load(args)
     print(f'   now  revision {current.revision}, {current.size_in_words}')
     copy = map_history.autosaved(args.map)
     if copy is not None:
-        print(f'autosaved  revision {copy.revision}, {copy.markers} markers: map undo takes it up')
+        print(f'autosaved  {copy.content}: map undo takes it up')
     return 0
 
 
@@ -283,10 +283,10 @@ def _undo(args: argparse.Namespace) -> int:
     copy = map_history.autosaved(args.map)
     if copy is not None:
         map_history.take_up_autosave(args.map)
-        print(f'{args.map}: the autosaved map is taken up; revision {copy.revision}, {copy.markers} markers')
+        print(f'{args.map}: the autosaved map is taken up; {copy.content}')
         return 0
     entry = map_history.undo(args.map)
-    print(f'{args.map}: undone: {entry.action}; revision {entry.revision}, {entry.markers} markers')
+    print(f'{args.map}: undone: {entry.action}; {entry.content}')
     return 0
 
 

@@ -12,6 +12,7 @@ from thermal_fiducial.cli.ranges import COORDINATE_M, REACH_M
 from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.se3 import apply, inverse, quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.point_cloud import load_cloud, save_alignment, thinned
@@ -70,7 +71,8 @@ def _print_result(alignment: CloudAlignment) -> None:
         table.add_row(*row)
     Console().print(table)
     distances = np.array([fit.distance_m for fit in alignment.fits])
-    print(f'{len(distances)} markers, {1e3 * np.sqrt(np.mean(distances**2)):.1f} mm rms from their surfaces')
+    rms_mm = 1e3 * np.sqrt(np.mean(distances**2))
+    print(f'{number_of(len(distances), "marker")}, {rms_mm:.1f} mm rms from their surfaces')
     if alignment.without_surface:
         print(f'no surface near markers {", ".join(map(str, alignment.without_surface))}')
     if alignment.open_directions:

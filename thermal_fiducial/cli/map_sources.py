@@ -22,6 +22,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS, Markers
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.csv_rows import named_rows
@@ -110,7 +111,7 @@ def _build(args: argparse.Namespace) -> int:
     frames = detect_in_photos(photos, camera, args)
     if args.origin is not None and not any(args.origin in rows['id'] for rows in frames):
         origin = f'marker {args.origin} of {args.dictionary}'
-        raise InputError(f'{args.images}: {origin}, the origin, is in none of the {len(frames)} photos')
+        raise InputError(f'{args.images}: {origin}, the origin, is in none of the {number_of(len(frames), "photo")}')
     return _grow(args, frames, camera, start, work, [photo.name for photo in photos])
 
 
@@ -157,7 +158,9 @@ def _grow(
     start = map_editing.with_covariances(start, _HAND_STD_M, np.deg2rad(_HAND_STD_DEG))
     config = _mapper_config(args, start.dictionary)
     with progress_bar('mapping') as progress:
-        built = build_map(frames, camera, start, config, lambda markers, share: progress(share, f'{markers} markers'))
+        built = build_map(
+            frames, camera, start, config, lambda markers, share: progress(share, number_of(markers, 'marker'))
+        )
     _print_what_was_used(built, len(frames), names)
     if not built.frames_used:
         raise InputError(f'{work.source}: no frame of it gives a pose in the map; {work.path} is left as it is')
@@ -171,7 +174,7 @@ def say_doubts(marker_map: MarkerMap, path: Path) -> list[Doubt]:
     found = [*doubts(marker_map), *_doubts_of_dictionary(marker_map, path.parent)]
     for doubt in found:
         print(doubt.text)
-    print(f'{path}: {len(found)} doubt{"" if len(found) == 1 else "s"}' if found else f'{path}: sound')
+    print(f'{path}: {number_of(len(found), "doubt")}' if found else f'{path}: sound')
     return found
 
 
@@ -186,7 +189,7 @@ def _doubts_of_dictionary(marker_map: MarkerMap, folder: Path) -> list[Doubt]:
 
 def _print_what_was_used(built: Built, frames: int, names: Sequence[str]) -> None:
     """What the map was built of; ``names`` of the frames, if they have any."""
-    print(f'{built.frames_used} of {frames} frames used')
+    print(f'{built.frames_used} of {number_of(frames, "frame")} used')
     _print_what_was_not(built.unused, names)
     if built.map.markers and all(marker.fixed for marker in built.map.markers.values()):
         print('all markers are fixed: none was moved (map unfix)')

@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
+from shlex import quote
 import sys
 
 import numpy as np
@@ -125,7 +126,7 @@ def _board(args: argparse.Namespace) -> int:
     _write_all([*markers, base], args, [board])
     _say_what_is_weak(markers, args, bits.shape[1] + 2)
     save_map(board, _board_map(centres, options, args.dictionary))
-    _say_how_to_use(f'markers --board {board} --plate-thickness {args.thickness / 1e3:g}')
+    _say_how_to_use(f'markers --board {quote(str(board))} --plate-thickness {args.thickness / 1e3:g}')
     return 0
 
 

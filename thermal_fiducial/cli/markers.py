@@ -11,6 +11,7 @@ from thermal_fiducial.cli.ranges import BITS, HAMMING, LENGTH_MM
 from thermal_fiducial.cli.subcommands import file_to_write, whole_number
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.detection.patterns import Dictionary
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bridges import darkest_white, find_bridges
 from thermal_fiducial.fabrication.cuttability import examine
@@ -68,7 +69,7 @@ def _check(args: argparse.Namespace) -> int:
             progress(done / len(ids))
     show(table)
     for complaint, times in against.items():
-        print(f'{times} of {len(ids)} markers: {complaint}')
+        print(f'{times} of {number_of(len(ids), "marker")}: {complaint}')
     between, own = distances(bits[ids])
     pairs = negatives(bits[ids], between)
     for a, b, apart in pairs:
@@ -76,7 +77,10 @@ def _check(args: argparse.Namespace) -> int:
     if pairs:
         signed = ' and '.join(sorted(path.stem for path in PACKAGED.glob('*_SIGNED.yaml')))
         print(f'only the border shows the polarity of these: set polarity, or use {signed}, which have none')
-    print(f'{good} of {len(ids)} markers can be cut; distance between markers {between}, to own rotations {own}')
+    print(
+        f'{good} of {number_of(len(ids), "marker")} can be cut; '
+        f'distance between markers {between}, to own rotations {own}'
+    )
     return 0
 
 
@@ -130,11 +134,11 @@ def _dictionary(args: argparse.Namespace) -> int:
             seed=args.seed,
             restarts=args.restarts,
             signed=args.signed,
-            progress=lambda done, most: progress(done / args.restarts, f'{most} markers'),
+            progress=lambda done, most: progress(done / args.restarts, number_of(most, 'marker')),
         )
     found = len(bits)
     if args.count is not None and args.count > found:
-        raise InputError(f'{found} markers found, not {args.count}; try more restarts')
+        raise InputError(f'{number_of(found, "marker")} found, not {args.count}; try more restarts')
     kept = bits[: args.count]
     save_dictionary(args.out, args.out.stem, Dictionary(kept, (args.distance - 1) // 2))
     count = ('' if args.count is None else f' --count {args.count}') + ' --signed' * args.signed
@@ -142,5 +146,5 @@ def _dictionary(args: argparse.Namespace) -> int:
     text = args.out.read_text(encoding='utf-8')
     write_text(args.out, f'# thermal-fiducial markers dictionary {args.out.name} {command}\n{text}')
     between, own = distances(kept)
-    print(f'{args.out}: {len(kept)} of {found} markers, distance {between}, to own rotations {own}')
+    print(f'{args.out}: {len(kept)} of {number_of(found, "marker")}, distance {between}, to own rotations {own}')
     return 0

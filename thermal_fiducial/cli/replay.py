@@ -11,6 +11,7 @@ from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import RATE
 from thermal_fiducial.cli.subcommands import add_remap
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.replay.earlier_runs import refuse_other_folder
@@ -91,8 +92,9 @@ def run(args: argparse.Namespace) -> int:
     seconds = time.monotonic() - started
     out = summary['messages_out']
     print(
-        f'{args.out}: {out.get("pose", 0)} poses, {out.get("camera_pose", 0)} camera poses, '
-        f'{summary["markers_in_map"]} markers in the map; {summary["duration_s"]:.1f} s of bag in {seconds:.1f} s'
+        f'{args.out}: {number_of(out.get("pose", 0), "pose")}, {number_of(out.get("camera_pose", 0), "camera pose")}, '
+        f'{number_of(summary["markers_in_map"], "marker")} in the map; '
+        f'{summary["duration_s"]:.1f} s of bag in {seconds:.1f} s'
     )
     if args.video:
         importlib.import_module('thermal_fiducial.cli.evaluate').make_video(

@@ -4,6 +4,7 @@ import argparse
 from dataclasses import replace
 import os
 from pathlib import Path
+from shlex import quote
 import textwrap
 
 from thermal_fiducial.cli.parser import Parser
@@ -135,16 +136,14 @@ def _sensor(sensor: Sensor, args: argparse.Namespace) -> Sensor:
 
 
 def _summary(out: Path, flight: FlightPlan) -> str:
-    start = f'{out}/{_start_map(flight)}'
+    # Of a board all markers are known, a room is to be mapped.
+    of_board = flight.scenario.corner_noise is not None
+    start, mode = ('map_true.yaml', ' --mode localization') if of_board else ('map_one.yaml', '')
+    bag, params, known = (quote(str(path)) for path in (out, out / 'params.yaml', out / start))
     return (
         f'{out}: {flight.scenario.name}, {flight.seconds:g} s, seed {flight.seed}\n'
-        f'replay it with: thermal-fiducial replay {out} --params {out}/params.yaml --map {start} --out RUN'
+        f'replay it with: thermal-fiducial replay {bag} --params {params} --map {known}{mode} --out RUN'
     )
-
-
-def _start_map(flight: FlightPlan) -> str:
-    """Map for the replay: of a board all markers are known, a room is to be mapped."""
-    return 'map_one.yaml' if flight.scenario.corner_noise is None else 'map_true.yaml --mode localization'
 
 
 def _cores() -> int:

@@ -10,6 +10,7 @@ from pathlib import Path
 import re
 
 from thermal_fiducial.core.mapping.map_data import MarkerMap
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.atomic import clean_up, locked, sync_folder, write_atomically
 from thermal_fiducial.files.map_format import parse_document
@@ -42,6 +43,11 @@ class MapVersion:
     markers: int = 0
     #: why it cannot be read; else empty
     problem: str = ''
+
+    @property
+    def content(self) -> str:
+        """Its revision and size in words."""
+        return f'revision {self.revision}, {number_of(self.markers, "marker")}'
 
 
 def history_folder(path: Path) -> Path:

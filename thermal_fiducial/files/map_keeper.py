@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from shlex import quote
 import tempfile
 from threading import Thread
 import time
@@ -97,10 +98,10 @@ class MapKeeper:
         entry = None if self._path is None else map_history.autosaved(self._path)
         if entry is None:
             return None, ''
-        found = f'{entry.path} (revision {entry.revision}, {entry.markers} markers)'
+        found = f'{entry.path} ({entry.content})'
         age_s = time.time() - entry.path.stat().st_mtime
         if not 0.0 <= age_s <= RESTART_PERIODS * autosave_period:
-            return None, f'{found} was never saved: thermal-fiducial map undo {self._path} takes it up'
+            return None, f'{found} was never saved: thermal-fiducial map undo {quote(str(self._path))} takes it up'
         try:
             recovered = load_map(entry.path, *self._sizes)
         except InputError as error:

@@ -12,6 +12,7 @@ from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import SECOND_NS
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map, save_map
@@ -232,7 +233,7 @@ def _report_refusals(files: RunFiles, entry: Entry, nodes: Sequence[str], warn: 
             if refused and refused >= int(figures[f'received /{topic}']):
                 raise InputError(f'not one message on {topic} could be used: {reason}')
         if refused:
-            warn(f'{node}: {refused} messages refused, the last one: {reason}')
+            warn(f'{node}: {number_of(refused, "message")} refused, the last one: {reason}')
 
 
 def _why_not(files: RunFiles, topic: str) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import so3_log
 from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.bridge_record import BridgeRecord
 
 GRAVITY = 9.81
@@ -55,7 +56,7 @@ def check_bridge(record: BridgeRecord) -> list[Finding]:
     """All findings, in the order in which they should be fixed."""
     if len(record.stamps_ns) < 2:
         text = 'mavros, PX4 and ArduPilot get nothing: is the filter initialised, does it see markers, is it lost?'
-        return [Finding('messages', Level.FAULT, f'{len(record.stamps_ns)} messages', text)]
+        return [Finding('messages', Level.FAULT, number_of(len(record.stamps_ns), 'message'), text)]
     values = _values(record)
     if values.level is Level.FAULT:
         return [values]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.table import number
 
@@ -39,7 +40,7 @@ def cards(evaluation: Evaluation, numbers: dict[str, Any]) -> list[Card]:
         _compared('Attitude error', 'deg', numbers, 'attitude_rms_deg'),
         _jitter(numbers),
         _map(numbers),
-        Card('Output', number(fused.get('rate_hz')), 'Hz', f'{fused["poses"]} poses'),
+        Card('Output', number(fused.get('rate_hz')), 'Hz', number_of(fused['poses'], 'pose')),
         Card(
             'Markers', str(markers['different']), 'seen', f'{markers["seen_in_a_frame"]:.1f} in a frame with any'
         ),
@@ -77,15 +78,16 @@ def _map(numbers: dict[str, Any]) -> Card | None:
     values = numbers.get('map')
     if values is None:
         return None
-    measured = f'{values["not_fixed"]}' if values['not_fixed'] else f'{values["markers"]} fixed'
-    return Card('Map error', number(values['position_rms_mm']), 'mm', f'rms of {measured} markers')
+    moved, every = values['not_fixed'], values['markers']
+    measured = number_of(moved, 'marker') if moved else number_of(every, 'fixed marker')
+    return Card('Map error', number(values['position_rms_mm']), 'mm', f'rms of {measured}')
 
 
 def _refused(numbers: dict[str, Any]) -> Card | None:
     values = numbers.get('innovations')
     if values is None:
         return None
-    return Card('Refused poses', str(values['refused']), '', f'of {values["poses"]} camera poses')
+    return Card('Refused poses', str(values['refused']), '', f'of {number_of(values["poses"], "camera pose")}')
 
 
 def _shutter(evaluation: Evaluation) -> Card | None:

@@ -12,6 +12,7 @@ from PIL import Image
 
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.report.evaluation import Evaluation
@@ -65,7 +66,7 @@ def draw_picture(evaluation: Evaluation, bag: Path, path: Path) -> None:
         frame.imshow(annotated(view.pixels, evaluation.run.detections, stamp_ns)[:, :, ::-1])
         frame.set_axis_off()
         found = int(np.sum(evaluation.run.detections.stamps_ns == stamp_ns))
-        frame.set_title(f'What the thermal camera sees: {found} markers found')
+        frame.set_title(f'What the thermal camera sees: {number_of(found, "marker")} found')
         _draw_map(above, evaluation)
         _draw_error(error, evaluation)
         buffer = io.BytesIO()

@@ -9,6 +9,7 @@ import plotly.graph_objects as go
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.time_plots import Chart, FIDUCIAL, FUSED, GOOD, MOST_DOTS, thinned, TRUTH
 from thermal_fiducial.report.trajectory import Trajectory
@@ -81,7 +82,7 @@ def _kind(marker: MapMarker, seen: set[int]) -> str:
 def _plates(evaluation: Evaluation, markers: Sequence[MapMarker]) -> list[Any]:
     """Squares of the markers, one trace per kind, with details of each as hover text."""
     seen = set(np.unique(evaluation.run.detections.ids).tolist())
-    words = {tag.id: f'{tag.status}: {tag.why}<br>{tag.views} views' for tag in evaluation.tags}
+    words = {tag.id: f'{tag.status}: {tag.why}<br>{number_of(tag.views, "view")}' for tag in evaluation.tags}
     made: list[Any] = []
     for kind, colour in _COLOURS.items():
         chosen = [marker for marker in markers if _kind(marker, seen) == kind]

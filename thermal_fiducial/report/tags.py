@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.map_error import marker_errors, MarkerError, sigmas
 from thermal_fiducial.report.run_folder import Run
 
@@ -62,7 +63,8 @@ def _standing(run: Run, key: int, views: int, reasons: dict[str, dict[int, str]]
         if key in reasons[_ON_TRIAL]:
             return 'on trial', reasons[_ON_TRIAL][key]
         localizing = run.summary.get('mode') == 'localization'
-        return 'not in the map', 'no marker enters the map in this mode' if localizing else f'seen in {views} frames'
+        seen = f'seen in {number_of(views, "frame")}'
+        return 'not in the map', 'no marker enters the map in this mode' if localizing else seen
     if not marker.trusted:
         return 'quarantined', reasons[_QUARANTINED].get(key, 'contradicted the others')
     if marker.fixed:

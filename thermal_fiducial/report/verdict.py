@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.evaluation import Evaluation
 
 #: NEES per degree of freedom up to which covariances are consistent, and above which they are far too small.
@@ -152,7 +153,7 @@ def _interruptions(evaluation: Evaluation) -> list[Remark]:
     remarks = []
     if shutter:
         longest = max(entry.seconds for entry in shutter)
-        remarks.append(Remark(Weight.GOOD, f'{_times(len(shutter), "shutter event")}, the longest {longest:.1f} s.'))
+        remarks.append(Remark(Weight.GOOD, f'{number_of(len(shutter), "shutter event")}, the longest {longest:.1f} s.'))
     if late:
         when = f'in the first {late[0].seconds:.1f} s' if len(evaluation.run.fiducial) else 'in the whole run'
         remarks.append(Remark(Weight.NOTE, f'No pose from the markers {when} ({late[0].cause.value}).'))
@@ -160,14 +161,10 @@ def _interruptions(evaluation: Evaluation) -> list[Remark]:
         longest = max(entry.seconds for entry in others)
         weight = Weight.DOUBT if longest > LONG_COAST_S else Weight.NOTE
         causes = ', '.join(sorted({entry.cause.value for entry in others}))
-        remarks.append(Remark(weight, f'{_times(len(others), "drop-out")} of up to {longest:.1f} s ({causes}).'))
+        remarks.append(Remark(weight, f'{number_of(len(others), "drop-out")} of up to {longest:.1f} s ({causes}).'))
     elif len(evaluation.run.fiducial):
         remarks.append(Remark(Weight.GOOD, 'No drop-out of the markers.'))
     return remarks
-
-
-def _times(count: int, noun: str) -> str:
-    return f'{count} {noun}{"s" if count > 1 else ""}'
 
 
 def _latency(numbers: dict[str, Any]) -> Remark | None:
@@ -180,7 +177,7 @@ def _latency(numbers: dict[str, Any]) -> Remark | None:
 def _resets(evaluation: Evaluation) -> Remark | None:
     values = evaluation.run.output.figures.get('resets')
     resets = 0 if values is None else int(values[1].max())
-    return Remark(Weight.DOUBT, f'The filter was reset {_times(resets, "time")}.') if resets else None
+    return Remark(Weight.DOUBT, f'The filter was reset {number_of(resets, "time")}.') if resets else None
 
 
 def _markers(evaluation: Evaluation) -> Remark | None:

@@ -122,6 +122,16 @@ def test_edits_make_versions_that_can_be_undone(path, poses, capsys):
     assert run('undo', path) == 2
 
 
+def test_a_map_of_one_marker_is_said_to_have_one(path, capsys):
+    assert run('delete', path, *range(1, 8)) == 0
+    assert run('delete', path, 0) == 0
+    assert run('history', path) == 0
+    assert run('undo', path) == 0
+    printed = capsys.readouterr().out
+    assert printed.count('1 marker') == 3
+    assert '1 markers' not in printed
+
+
 @pytest.mark.parametrize(
     'arguments',
     [

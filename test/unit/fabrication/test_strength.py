@@ -80,8 +80,8 @@ def test_what_speaks_against_a_plate(options, said, tmp_path, capsys):
     assert 'narrowest web' in output.out
     assert main(['markers', 'check', '--ids', '5', *arguments]) == 0
     printed = capsys.readouterr().out
-    assert f'1 of 1 markers: {said}' in printed
-    assert '0 of 1 markers can be cut' in printed
+    assert f'1 of 1 marker: {said}' in printed
+    assert '0 of 1 marker can be cut' in printed
 
 
 def test_the_plate_of_the_defaults_is_fine(tmp_path, capsys):

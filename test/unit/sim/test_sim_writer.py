@@ -2,6 +2,8 @@ from dataclasses import replace
 import math
 import multiprocessing
 import os
+from pathlib import Path
+import shlex
 import signal
 import sys
 import time
@@ -241,7 +243,7 @@ def tiny_scenario(monkeypatch):
 
 
 def test_command_writes_a_bag_and_prints_how_to_replay_it(tiny_scenario, tmp_path, capsys):
-    out = tmp_path / 'new' / 'bag'
+    out = tmp_path / 'new bags' / 'bag'
     options = [
         '--scenario',
         'tiny',
@@ -257,11 +259,21 @@ def test_command_writes_a_bag_and_prints_how_to_replay_it(tiny_scenario, tmp_pat
         '0.01',
     ]
     assert main(['simulate', str(out), *options, '--storage', 'sqlite3', '--inverted', '--workers', '1']) == 0
-    assert f'replay {out}' in capsys.readouterr().out
+    # As a shell reads it.
+    words = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert words[words.index('replay', 1) :][:2] == ['replay', str(out)]
+    assert str(out / 'params.yaml') in words
     with BagReader(out) as reader:
         assert reader.message_count(['thermal/image_raw']) == 20
     assert list(out.glob('*.db3'))
     assert 'readout_time: 0.01' in (out / 'params.yaml').read_text()
+
+
+def test_the_printed_replay_of_a_board_is_one_with_its_map(tmp_path, capsys):
+    assert main(['simulate', str(tmp_path / 'of a board'), '--scenario', 'april', '--seconds', '3']) == 0
+    words = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert Path(words[words.index('--map') + 1]).is_file()
+    assert words[words.index('--mode') + 1] == 'localization'
 
 
 def test_command_takes_a_frame_rate(tiny_scenario, tmp_path):

@@ -17,6 +17,7 @@ from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.geometry.se3 import apply, quaternion_from_rotation, rigid_alignment
 from thermal_fiducial.core.measurements import CameraPose, MAP_DTYPE
 from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 
 # Residual of a common marker, in units of the median, beyond which it doesn't take part in an alignment.
@@ -86,8 +87,7 @@ class MarkerMap:
     @property
     def size_in_words(self) -> str:
         """How many markers it has."""
-        count = len(self.markers)
-        return '1 marker' if count == 1 else f'{count} markers'
+        return number_of(len(self.markers), 'marker')
 
     def copy(self) -> 'MarkerMap':
         """A copy that shares the immutable markers."""
