@@ -15,7 +15,7 @@ from thermal_fiducial.core.geometry.se3 import rotation_from_quaternion, so3_exp
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.ros.base.node import ERROR, WARN
-from thermal_fiducial.ros.filter_node.bridge import px4_odometry
+from thermal_fiducial.ros.filter_node.bridge import FlightControllerBridge, px4_odometry
 from thermal_fiducial.ros.messages import convert
 
 pytestmark = pytest.mark.ros
@@ -142,6 +142,20 @@ def test_the_smooth_topic_is_another_one_and_feeds_the_bridge():
     steps = [np.abs(np.diff([m.pose.pose.position.x for m in messages])).max() for messages in (exact, smooth)]
     # A correction is spread over 100 ms, twenty IMU samples.
     assert 0.0 < steps[1] < 0.5 * steps[0]
+
+
+@pytest.mark.parametrize(('smoothing', 'jumps'), [({}, 2), ({'smoothing_time': 1.0}, 1)])
+def test_px4_hears_of_jumps_of_what_is_sent(monkeypatch, smoothing, jumps):
+    """A correction of the map is a jump of the pose; where the pose glides there, none must be announced."""
+    counted = []
+    monkeypatch.setattr(FlightControllerBridge, 'send', lambda bridge, sent, written, resets: counted.append(resets))
+    with ros_graph() as graph:
+        graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], bridge_rate=1000.0, **smoothing)
+        fly(graph, range(60))
+        T_new_old = transform(np.eye(3), [0.0, 0.05, 0.0])
+        graph.send('map_correction', convert.transform_message(T_new_old, START + 60 * 5_000_000, 'map', 'map_before'))
+        fly(graph, range(60, 90), poses_until=0)
+    assert (counted[0], counted[-1]) == (1, jumps)
 
 
 @pytest.mark.parametrize('reset', [False, True])

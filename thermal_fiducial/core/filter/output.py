@@ -100,19 +100,22 @@ class SmoothOutput:
     def __init__(self, seconds: float) -> None:
         """``seconds``: time constant [s]."""
         self._seconds = seconds
+        #: number of poses that do not continue the one before
+        self.jumps = 0
         self._consistent: Odometry | None = None
         self._T = np.eye(4)
 
     def follow(self, odometry: Odometry) -> Odometry:
         """Odometry with the smooth pose; its covariance and twist are the filter's."""
         if self._consistent is None or odometry.stamp_ns <= self._consistent.stamp_ns:
-            self._T = odometry.T_map_body
+            self._T, share = odometry.T_map_body, 0.0
         else:
             dt = (odometry.stamp_ns - self._consistent.stamp_ns) * 1e-9
             left = inverse(odometry.T_map_body) @ self._T @ _motion(self._consistent, odometry, dt)
             share = math.exp(-dt / self._seconds) if np.linalg.norm(left[:3, 3]) < LARGEST_STEP else 0.0
             rotation = so3_exp(share * so3_log(left[:3, :3]))
             self._T = odometry.T_map_body @ transform(rotation, share * left[:3, 3])
+        self.jumps += share == 0.0
         self._consistent = odometry
         return replace(odometry, T_map_body=self._T)
 

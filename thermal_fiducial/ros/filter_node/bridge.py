@@ -57,7 +57,7 @@ class FlightControllerBridge:
         Parameters
         ----------
         written : the same state, serialised
-        resets : number of jumps of the pose; PX4 applies a jump to its state when this counter changes
+        resets : number of jumps of this pose; PX4 applies a jump to its state when this counter changes
         """
         stamp = odometry.stamp_ns
         if not self._period_ns or self._due_ns - self._period_ns < stamp < self._due_ns:

@@ -58,8 +58,10 @@ class FilterOutputs:
         lost : whether the pose is unfit to fly on
         jumps : number of jumps of the pose so far
         """
-        smooth = self._smoother.follow(odometry) if self._smoother and odometry else None
-        if lost and self._smoother:
+        smooth = odometry if self._smoother else None
+        if self._smoother and odometry and not lost:
+            smooth, jumps = self._smoother.follow(odometry), self._smoother.jumps
+        elif self._smoother:
             self._smoother.begin_again()
         if odometry is None:
             return

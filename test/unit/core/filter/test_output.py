@@ -54,6 +54,18 @@ def test_a_step_too_large_to_spread_and_a_clock_that_goes_back_start_it_anew(k):
     assert aside(output.follow(after)) == pytest.approx(aside(new), abs=1e-12)
 
 
+def test_jumps_are_counted_and_what_is_spread_is_none():
+    output, jumps = SmoothOutput(SECONDS), []
+    # Its start, a correction that is spread, a step, and a new start; sample 3 continues the step.
+    for k, off in ((0, 0.0), (1, 0.1), (2, 0.1 + 1.2 * LARGEST_STEP), (3, 0.1 + 1.2 * LARGEST_STEP)):
+        output.follow(at(k, off))
+        jumps.append(output.jumps)
+    output.begin_again()
+    output.begin_again()
+    output.follow(at(4))
+    assert [*jumps, output.jumps] == [1, 1, 2, 2, 3]
+
+
 def test_what_begins_again_does_not_continue_a_pose_that_was_wrong():
     output = SmoothOutput(SECONDS)
     output.follow(at(0))
