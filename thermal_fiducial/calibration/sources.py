@@ -1,6 +1,6 @@
 """Raw frames, IMU samples and intrinsics from a folder of pictures or a bag."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 from thermal_fiducial.files.images import read_picture as load_picture
 from thermal_fiducial.files.reading import naming
+from thermal_fiducial.files.recordings import imu_samples
 
 #: Columns of a file of measured points; a header may hold more.
 POINT_COLUMNS = ('view', 'point', 'u', 'v', 'x', 'y')
@@ -151,8 +152,20 @@ def imu_track(bag: BagReader) -> tuple[ImuTrack, int]:
         stamps.append(stamp_to_ns(message.header.stamp))
         rate, force = message.angular_velocity, message.linear_acceleration
         values.append((rate.x, rate.y, rate.z, force.x, force.y, force.z))
+    return _in_order(bag.path, stamps, np.array(values, dtype=np.float64))
+
+
+def imu_track_of_csv(path: Path) -> ImuTrack:
+    """IMU samples of a CSV file in order, as :func:`imu_track`; see :func:`imu_samples`."""
+    samples = imu_samples(path)
+    values = np.array([(*sample.angular_velocity, *sample.linear_acceleration) for sample in samples])
+    return _in_order(path, [sample.stamp_ns for sample in samples], values)[0]
+
+
+def _in_order(path: Path, stamps: Sequence[int], values: FloatArray) -> tuple[ImuTrack, int]:
+    """Track of samples, turn rates and forces (N, 6), and its first stamp [ns]."""
     order, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
-    table = np.array(values, dtype=np.float64)[first]
+    table = values[first]
     if len(order) < 2 or not np.all(np.isfinite(table)):
-        raise InputError(f'{bag.path}: the IMU samples are not finite numbers at increasing stamps')
+        raise InputError(f'{path}: the IMU samples are not finite numbers at increasing stamps')
     return ImuTrack((order - order[0]) * 1e-9, table[:, :3], table[:, 3:]), int(order[0])

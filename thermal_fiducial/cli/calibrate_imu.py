@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermal_fiducial.calibration.sources import imu_track
+from thermal_fiducial.calibration.sources import imu_track, imu_track_of_csv
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.subcommands import add_remap, file_to_write
 from thermal_fiducial.config import ImuNoise
@@ -28,10 +28,19 @@ def add_imu(parser: Parser) -> None:
     """Options of the action."""
     parser.set_defaults(do=calibrate_imu)
     parser.add_argument(
-        'bag', type=Path, metavar='BAG', help='bag with imu/data, the robot at rest (minutes, better hours)'
+        'source',
+        type=Path,
+        metavar='SOURCE',
+        help='the robot at rest (minutes, better hours): a bag with imu/data, or a CSV file of samples '
+        '(stamp [ns], turn rates x y z [rad/s], accelerations x y z [m/s^2])',
     )
     parser.add_argument('--out', type=file_to_write, default=Path('imu.yaml'), help='parameters to write')
     add_remap(parser)
+    parser.refuse(['--remap'], 'with a CSV file of samples', _is_csv)
+
+
+def _is_csv(args: argparse.Namespace) -> bool:
+    return bool(args.source.suffix.lower() == '.csv')
 
 
 def calibrate_imu(args: argparse.Namespace) -> int:
@@ -39,9 +48,12 @@ def calibrate_imu(args: argparse.Namespace) -> int:
     # allantools takes a second to import, which the other calibrations do not need.
     from thermal_fiducial.calibration.allan_deviation import fit_noise
 
-    with BagReader(args.bag, parse_remaps(args.remap)) as bag:
-        track, _ = imu_track(bag)
-    with naming(args.bag):
+    if _is_csv(args):
+        track = imu_track_of_csv(args.source)
+    else:
+        with BagReader(args.source, parse_remaps(args.remap)) as bag:
+            track, _ = imu_track(bag)
+    with naming(args.source):
         fit = fit_noise(track)
     text = noise_text(fit)
     write_text(args.out, text)

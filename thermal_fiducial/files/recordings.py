@@ -121,7 +121,7 @@ def _ours(folder: Path, camera: str) -> Recording:
     if reference.exists():
         stamps, positions, quaternions = load_tum(reference)
         truth = stamps, transform_from_quaternion(positions, quaternions)
-    samples = _samples(folder / 'imu.csv')
+    samples = imu_samples(folder / 'imu.csv')
     poses = folder / 'camera_pose.csv'
     if poses.exists():
         return Recording(rig, samples, poses=_poses(poses), truth=truth)
@@ -138,7 +138,7 @@ def _asl(folder: Path, camera: str) -> Recording:
         Picture(_stamp(f'{folder / camera / "data.csv"} line {number}', words[0]), folder / camera / 'data' / words[1])
         for number, words in _lines(folder / camera / 'data.csv', 2)
     ]
-    samples = _samples(folder / 'imu0' / 'data.csv')
+    samples = imu_samples(folder / 'imu0' / 'data.csv')
     reference = folder / 'state_groundtruth_estimate0'
     truth = _asl_truth(reference, folder / 'imu0') if (reference / 'data.csv').exists() else None
     return Recording(rig, samples, pictures=pictures, truth=truth)
@@ -169,7 +169,7 @@ def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) 
     if not pictures:
         raise InputError(f'{place}: no pictures')
     pictures.sort(key=lambda picture: picture.stamp_ns)
-    return Recording(of_camchain(chain, camera, known), _samples(folder / 'imu0.csv'), pictures=pictures)
+    return Recording(of_camchain(chain, camera, known), imu_samples(folder / 'imu0.csv'), pictures=pictures)
 
 
 # --- tables -------------------------------------------------------------------------------------------
@@ -231,7 +231,14 @@ def _numbers(where: str, words: list[str]) -> list[float]:
     return values
 
 
-def _samples(path: Path) -> list[ImuSample]:
+def imu_samples(path: Path) -> list[ImuSample]:
+    """Samples of a CSV file of ours, EuRoC or Kalibr: stamp [ns], turn rates [rad/s], specific forces [m/s^2].
+
+    Raises
+    ------
+    InputError
+        Unreadable, no such columns, or most likely in other units; the message names file and line.
+    """
     stamps, values = _table(path, 7, lambda row: is_imu_reading(row[:3], row[3:6]))
     _check_units(path, stamps, values)
     return [ImuSample(int(stamp), row[:3], row[3:6]) for stamp, row in zip(stamps, values, strict=True)]

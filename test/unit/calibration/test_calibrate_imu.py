@@ -78,6 +78,23 @@ def test_the_command_writes_parameters(tmp_path, capsys):
     assert '# in flight; at rest ' in printed
 
 
+def test_the_command_takes_a_csv_file(tmp_path, capsys):
+    times, values = at_rest(60.0)
+    stamps = small_bag.START_NS + np.round(times * 1e9).astype(np.int64)
+    file, out = tmp_path / 'imu.csv', tmp_path / 'imu.yaml'
+    lines = [','.join(map(str, (stamp, *row))) for stamp, row in zip(stamps.tolist(), values.tolist(), strict=True)]
+    file.write_text('\n'.join(['stamp_ns,wx,wy,wz,ax,ay,az', *lines]))
+    assert main(['calibrate', 'imu', str(file), '--out', str(out)]) == 0
+    written = yaml.safe_load(out.read_text())['/**']['ros__parameters']['imu']
+    # A random walk of 4e-4 adds a few per cent at the shortest averaging times.
+    assert written['gyroscope_noise_density'] == pytest.approx(3e-3, rel=0.05)
+    assert main(['calibrate', 'imu', str(file), '--remap', 'a:=b']) == 2
+    assert '--remap has no effect with a CSV file' in capsys.readouterr().err
+    # Stamps in seconds.
+    file.write_text('\n'.join(['t,wx,wy,wz,ax,ay,az', *(line[10:] for line in lines)]))
+    assert main(['calibrate', 'imu', str(file)]) == 2
+
+
 @pytest.mark.parametrize(
     ('change', 'words'),
     [
