@@ -60,7 +60,12 @@ class CameraClock:
     @property
     def in_question(self) -> bool:
         """Whether poses have an unusual delay since a jump of the IMU's stamps, with no cause found yet."""
-        return self._imu_jump_ns != 0 and 0 < self._waited < _PATIENCE
+        return self.suspects_imu and self._waited > 0
+
+    @property
+    def suspects_imu(self) -> bool:
+        """Whether the IMU's clock may have stepped at the last jump of its stamps: no delay has shown it yet."""
+        return self._imu_jump_ns != 0 and self._waited < _PATIENCE
 
     def is_of_imu(self, step_ns: int) -> bool:
         """Whether an apparent step of the camera's clock is a step of the IMU's."""

@@ -96,6 +96,7 @@ class PoseEkf:
         self._refused_in_row = 0
         if self._input.jump_ns:
             self._camera_clock.imu_jumped(self._input.jump_ns)
+            self._history.suspect_jump(self._input.excess_ns)
         imu, buffer = np.concatenate((sample.angular_velocity, sample.linear_acceleration)), self._history.imu
         seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS
         densities = self._noise.densities(imu, seconds) if len(buffer) else np.zeros(6)
@@ -152,6 +153,8 @@ class PoseEkf:
             return pose, 0
         interval_ns = self._input.longest_ns
         step_ns = clock.proposed(pose, history.imu.newest_ns, interval_ns)
+        if not clock.suspects_imu:
+            history.explain_jump()
         if not step_ns:
             return pose, 0
         if abs(step_ns) < SMALLEST_STEP_NS:

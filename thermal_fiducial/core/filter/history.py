@@ -6,6 +6,7 @@ arrival. The exception is ``MotionAtPose``, which also averages the few samples 
 
 from bisect import bisect_left, bisect_right, insort
 from collections.abc import Collection, Iterable
+from dataclasses import replace
 import math
 from operator import attrgetter
 
@@ -59,6 +60,8 @@ class History:
         self._imu_steps: list[tuple[int, float]] = []
         #: main hypothesis of the latest belief, propagated to the newest sample
         self.main: Hypothesis | None = None
+        #: the same if the last jump of the IMU's stamps is a step of its clock, until that is known
+        self._stepped: Hypothesis | None = None
 
     @property
     def belief(self) -> Belief:
@@ -66,7 +69,12 @@ class History:
         return self._beliefs[-1]
 
     def contradicting(self) -> Estimate | None:
-        """The alternative estimate at the newest sample, if the latest poses contradict the main one and support it."""
+        """The alternative estimate at the newest sample, if the latest poses contradict the main one and support it.
+
+        Also one without the time of a jump of the IMU's stamps, until the delay of poses shows whether it has passed.
+        """
+        if self._stepped:
+            return self._stepped.estimate
         other = self.belief.alternative
         if other is None or other.hits < self.config.initial_poses or not (self.main and self.main.in_doubt):
             return None
@@ -129,9 +137,22 @@ class History:
         """Allow for a step of the IMU's clock by ``size_ns`` after the newest sample: or samples are lost there."""
         self._imu_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
 
+    def suspect_jump(self, size_ns: int) -> None:
+        """Allow for a step of the IMU's clock by all of ``size_ns`` after the newest sample: or samples are lost there.
+
+        If it has stepped, the robot is at the end of the jump where it was at its beginning.
+        """
+        if self.main:
+            before = self._carried(self.main, self.imu.newest_ns).estimate
+            self._stepped = self.main._replace(estimate=replace(before, stamp_ns=before.stamp_ns + size_ns))
+
+    def explain_jump(self) -> None:
+        """The clock of the IMU has not stepped: samples are lost."""
+        self._stepped = None
+
     def forget_poses(self) -> None:
         """Remove all poses and beliefs."""
-        self._poses, self._beliefs, self.main = [], [Belief()], None
+        self._poses, self._beliefs, self.main, self._stepped = [], [Belief()], None, None
 
     def _undo_from(self, stamp_ns: int) -> None:
         """Remove the beliefs after poses of ``stamp_ns`` and later."""
@@ -155,6 +176,8 @@ class History:
             self.main = belief.main
             self.log.add(belief.verdict)
         newest_ns, belief = self.imu.newest_ns, self.belief
+        if self._stepped:
+            self._stepped = self._carried(self._stepped, newest_ns)
         if self.main and belief.main:
             self.main = self._carried(self.main, newest_ns)
             if newest_ns - belief.main.estimate.stamp_ns >= _KEPT_EVERY_NS:
