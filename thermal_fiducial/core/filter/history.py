@@ -32,6 +32,9 @@ _KEPT_EVERY_NS = 10_000_000
 #: Standard deviation of a suspected step of the IMU's clock as a share of its size: the clock has stepped by all of it,
 #: or samples are lost and it has not stepped, with equal odds.
 _STEP_OR_LOSS = 0.5
+#: Share of the unusual steps between samples that are steps of all clocks, or of the IMU's by 35 ms and more: at all
+#: recorded gaps samples were lost.
+_STEPS = 0.1
 _stamp = attrgetter('stamp_ns')
 
 
@@ -58,6 +61,8 @@ class History:
         self._camera_steps: dict[int, int] = {}
         #: suspected steps of the IMU's clock: stamp of the sample before [ns], standard deviation [s]
         self._imu_steps: list[tuple[int, float]] = []
+        #: the same of all clocks
+        self._clock_steps: list[tuple[int, float]] = []
         #: main hypothesis of the latest belief, propagated to the newest sample
         self.main: Hypothesis | None = None
         #: the same if the last jump of the IMU's stamps is a step of its clock, until that is known
@@ -68,17 +73,21 @@ class History:
         """The latest belief."""
         return self._beliefs[-1]
 
-    def contradicting(self) -> Estimate | None:
+    def contradicting(self) -> tuple[Estimate, float] | None:
         """The alternative estimate at the newest sample, if the latest poses contradict the main one and support it.
 
         Also one without the time of a jump of the IMU's stamps, until the delay of poses shows whether it has passed.
+
+        Returns
+        -------
+        The estimate, and the share of the square of the difference that counts.
         """
         if self._stepped:
-            return self._stepped.estimate
+            return self._stepped.estimate, _STEPS
         other = self.belief.alternative
         if other is None or other.hits < self.config.initial_poses or not (self.main and self.main.in_doubt):
             return None
-        return self._carried(other, self.imu.newest_ns).estimate
+        return self._carried(other, self.imu.newest_ns).estimate, 1.0
 
     def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None, first_offset: float = 0.0) -> int:
         """Instant of a pose in the IMU's clock, by the clock offset of ``hypothesis``; without one ``first_offset``."""
@@ -136,6 +145,11 @@ class History:
     def suspect_imu_step(self, size_ns: int) -> None:
         """Allow for a step of the IMU's clock by ``size_ns`` after the newest sample: or samples are lost there."""
         self._imu_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
+        self._suspect_clock_steps(size_ns)
+
+    def _suspect_clock_steps(self, size_ns: int) -> None:
+        """Allow for a step of all clocks by ``size_ns``: the next pose shows it, and nothing until then."""
+        self._clock_steps.append((self.imu.newest_ns, math.sqrt(_STEPS) * size_ns / SECOND_NS))
 
     def suspect_jump(self, size_ns: int) -> None:
         """Allow for a step of the IMU's clock by all of ``size_ns`` after the newest sample: or samples are lost there.
@@ -145,6 +159,7 @@ class History:
         if self.main:
             before = self._carried(self.main, self.imu.newest_ns).estimate
             self._stepped = self.main._replace(estimate=replace(before, stamp_ns=before.stamp_ns + size_ns))
+        self._suspect_clock_steps(size_ns)
 
     def explain_jump(self) -> None:
         """The clock of the IMU has not stepped: samples are lost."""
@@ -269,6 +284,9 @@ class History:
         estimate = self._carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate
         if step_ns := self._camera_steps.get(pose.stamp_ns, 0):
             estimate = estimate.after_camera_step(step_ns / SECOND_NS)
+        for begin_ns, std in self._clock_steps:
+            if hypothesis.accepted_ns <= begin_ns < estimate.stamp_ns:
+                estimate = estimate.after_clock_steps(self.imu.at(estimate.stamp_ns), std)
         motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)
         measured = body_pose(pose, estimate.state.T_body_camera, self.config.pose_noise_scale)
         return innovation_of(self.config, estimate, measured, motion)
@@ -306,3 +324,5 @@ class History:
         kept = {pose.stamp_ns for pose in self._poses}
         self._camera_steps = {stamp: step for stamp, step in self._camera_steps.items() if stamp in kept}
         self._imu_steps = [step for step in self._imu_steps if step[0] >= self.imu.oldest_ns]
+        accepted_ns = min((h.accepted_ns for h in oldest.hypotheses), default=horizon_ns)
+        self._clock_steps = [step for step in self._clock_steps if step[0] >= accepted_ns]

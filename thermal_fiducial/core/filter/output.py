@@ -31,20 +31,22 @@ TRACKING, WAITING = Condition('tracking'), Condition('waiting for markers')
 COASTING_S = 0.5
 
 
-def odometry(estimate: Estimate, other: Estimate | None, sample: LastSample) -> Odometry:
+def odometry(estimate: Estimate, contradicting: tuple[Estimate, float] | None, sample: LastSample) -> Odometry:
     """Odometry at an IMU sample.
 
     Parameters
     ----------
-    other : estimate of the same instant that contradicts it: it widens the covariance by its own and their difference
+    contradicting : another estimate of the same instant, which widens the covariance by its own, and by a share of the
+        square of their difference
     """
     state = estimate.state
     R, velocity_body = state.R_map_body, state.velocity_body
     joint = estimate.covariance[PUBLISHED, PUBLISHED]
-    if other:
+    if contradicting:
+        other, share = contradicting
         apart = _difference(state, other.state)
         joint = joint.copy()
-        joint[CORE, CORE] += other.covariance[CORE, CORE] + np.outer(apart, apart)
+        joint[CORE, CORE] += other.covariance[CORE, CORE] + share * np.outer(apart, apart)
     # Position and rotation errors turn from the robot frame into the map; that of v_body depends on nu and phi.
     J = _AT_REST.copy()
     J[0:3, POSITION] = J[3:6, ROTATION] = R

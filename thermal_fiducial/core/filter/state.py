@@ -154,6 +154,14 @@ class Estimate:
         error = of_clock(self.state.derivative(imu))
         return replace(self, covariance=self.covariance + std**2 * np.outer(error, error))
 
+    def after_clock_steps(self, imu: FloatArray, std: float) -> 'Estimate':
+        """The estimate after an unknown step of all clocks, of standard deviation ``std`` [s]: time did not pass.
+
+        ``imu`` (6,): the latest sample.
+        """
+        error = of_core(self.state.derivative(imu))
+        return replace(self, covariance=self.covariance + std**2 * np.outer(error, error))
+
     def std(self, place: slice | int) -> float:
         """Root of the sum of the variances of some coordinates: relative to the map, as poses show them."""
         return math.sqrt(float(self.covariance.diagonal()[place].sum()))
