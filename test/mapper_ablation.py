@@ -83,7 +83,9 @@ MECHANISMS = {
         {'localization:_JointFit.alternative': _ignored},
     ),
     'poses that nearly merge': Mechanism(
-        ('small markers', 'chain'), ('localization:_widened',), {'localization:_widened': lambda found, _: found}
+        ('from the front', 'small markers'),
+        ('localization:_widened',),
+        {'localization:_widened': lambda found, _: found},
     ),
     'error of the aspect ratio': Mechanism(
         ('board', 'surveyed board'), (), {'mapper:SystematicErrors': partial(SystematicErrors, aspect=0.0)}
@@ -107,7 +109,7 @@ MECHANISMS = {
         {'mapper:MarkerMapper._without_pose': lambda self, frame, refusal: (False, {})},
     ),
     'markers turned back': Mechanism(
-        ('small markers', 'wall'),
+        ('turned markers', 'wall'),
         ('bundle_adjustment:_with_mirrored',),
         {'bundle_adjustment:_with_mirrored': _ignored},
     ),

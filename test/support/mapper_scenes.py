@@ -205,6 +205,46 @@ def small_markers() -> Figures:
     return {'located %': float(np.mean(located)), 'placed': entered, 'wrong': wrong}
 
 
+def from_the_front() -> Figures:
+    """A known marker alone, seen nearly along its axis: its two poses merge. Odometry is off by 0.1 m and 0.2 rad."""
+    located = []
+    poses = {0: walls.wall(np.random.default_rng(0), 1, tilt=0.0)[0]}
+    config = MarkerMapperConfig(mode='localization', **AS_BODY)
+    place, stds = poses[0][:3, 3], np.repeat([0.1, 0.2], 3)
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        aside = rng.normal(0.0, 0.3, size=2)
+        T = walls.look(place - [rng.uniform(4.0, 6.0), *aside], place)
+        off = retract(T, stds * rng.normal(size=6))
+        odometry = Odometry(walls.stamp(0), off, np.zeros(3), np.zeros(3), np.diag(stds**2), 1e-6 * np.eye(6))
+        mapper = MarkerMapper(config, MarkerMap({0: MapMarker(0, walls.SIZE, True, poses[0])}))
+        rows = walls.see(T, poses, 0.1, rng)
+        pose = mapper.process(walls.stamp(0), rows, walls.CAMERA, motion_prior(odometry)).pose
+        if pose is not None:
+            located.append((T, pose.T_map_camera, pose.covariance))
+    return {'located %': len(located) / 3.0, **_errors('pose', located)}
+
+
+def turned_markers() -> Figures:
+    """Three of eight mapped markers of a wall have the other one of their two poses when the map is adjusted."""
+    wrong = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        poses = walls.wall(rng, tilt=0.3)
+        mapper = MarkerMapper(MarkerMapperConfig(), MarkerMap({0: MapMarker(0, walls.SIZE, True, poses[0])}))
+        frames = {walls.stamp(k): walls.see(walls.flight(k / 30), poses, 0.3, rng) for k in range(0, 600, 5)}
+        _mapped(mapper, frames, walls.CAMERA)
+        markers = mapper.map.markers
+        for key in (2, 5, 7):
+            markers[key] = replace(markers[key], T_map_marker=walls.mirrored(poses[key], walls.flight(0.0)))
+        mapper.refine()
+        wrong += sum(
+            bool(np.linalg.norm(difference(marker.T_map_marker, poses[key])[3:]) > np.deg2rad(8.0))
+            for key, marker in mapper.map.markers.items()
+        )
+    return {'turned': wrong}
+
+
 def chain() -> Figures:
     """A corridor of markers of which at most two are in view, some spans with none known: odometry that drifts."""
     maps, located = [], []
@@ -376,6 +416,8 @@ SCENES: dict[str, Callable[[], Figures]] = {
     'shaped markers': lambda: wall(0.07),
     'wrong lens': wrong_lens,
     'small markers': small_markers,
+    'from the front': from_the_front,
+    'turned markers': turned_markers,
     'chain': chain,
     'bent corridor': bent,
     'moved markers': moved_marker,

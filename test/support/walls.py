@@ -39,6 +39,14 @@ def look(position, target, roll=0.0):
     return transform(np.stack([x, np.cross(z, x), z], axis=-1) @ so3_exp([0.0, 0.0, roll]), position)
 
 
+def mirrored(T_map_marker, T_map_camera):
+    """About the other pose of a marker that a camera sees alike: turned half round the line of sight and its normal."""
+    sight = T_map_camera[:3, 3] - T_map_marker[:3, 3]
+    half_turn = so3_exp(np.pi * sight / np.linalg.norm(sight))
+    R = half_turn @ T_map_marker[:3, :3] @ so3_exp([0.0, 0.0, np.pi])
+    return transform(R, T_map_marker[:3, 3])
+
+
 def flight(t):
     """T_map_camera of a slow flight in front of the wall at time ``t`` [s]."""
     position = [-3.2 + 0.7 * np.sin(0.6 * t), 1.4 * np.sin(0.45 * t), 1.5 + 0.5 * np.sin(0.8 * t)]

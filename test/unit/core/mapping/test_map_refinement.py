@@ -5,7 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from support.walls import CAMERA, flight, NO_SYSTEMATIC_ERRORS, see, SIZE, wall
+from support.walls import CAMERA, flight, mirrored, NO_SYSTEMATIC_ERRORS, see, SIZE, wall
 from support.wrong_lenses import drawn_lens
 
 from thermal_fiducial.core.error_model import covariance_of, draws_of, SystematicErrors
@@ -63,14 +63,6 @@ def snapshot(rng, poses, sigma=0.02, count=30, disturbance=0.01, fixed=(0,)):
 
 def errors(refinement, poses):
     return np.stack([difference(marker.T_map_marker, poses[i]) for i, marker in refinement.markers.items()])
-
-
-def mirrored(T_map_marker, T_map_camera):
-    """About the other pose of a marker that a camera sees alike: turned half round the line of sight and its normal."""
-    sight = T_map_camera[:3, 3] - T_map_marker[:3, 3]
-    half_turn = so3_exp(np.pi * sight / np.linalg.norm(sight))
-    R = half_turn @ T_map_marker[:3, :3] @ so3_exp([0.0, 0.0, np.pi])
-    return transform(R, T_map_marker[:3, 3])
 
 
 def test_markers_that_entered_in_the_wrong_one_of_two_poses_are_turned_back():
