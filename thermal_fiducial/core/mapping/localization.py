@@ -110,14 +110,17 @@ def _widened(found: Location, other: _Alternative) -> Location:
     apart, covariance = difference(other.T_map_camera, found.pose.T_map_camera), found.pose.covariance
     expected = float(apart @ np.linalg.solve(covariance, apart))
     share = max(math.exp(-0.5 * other.excess) - math.exp(-0.5 * expected), 0.0)
-    spread = of_single_error(apart, math.sqrt(share))
-    return replace(
-        found, pose=replace(found.pose, covariance=covariance + spread), noise=found.noise + spread, settled=False
-    )
+    return _with_spread(found, of_single_error(apart, math.sqrt(share)))
+
+
+def _with_spread(found: Location, spread: FloatArray) -> Location:
+    """A location that may be another one, at a covariance that is larger by ``spread`` (6, 6)."""
+    pose = replace(found.pose, covariance=found.pose.covariance + spread)
+    return replace(found, pose=pose, noise=found.noise + spread, settled=False)
 
 
 def _either(frame: '_JointFit', found: Location, other: _Alternative, prior: CameraPose | None) -> Location | Refusal:
-    """Choose between two poses that the corners allow, by the prior; refuse without one."""
+    """The likelier of two poses that the corners allow, by the prior, by its odds uncertain; refuse without one."""
     T = other.T_map_camera
     second = frame.refined(T, frame.sight.reprojected(frame.camera, T), found.weights)
     # One that hardly fits at all ends anywhere.
@@ -125,7 +128,11 @@ def _either(frame: '_JointFit', found: Location, other: _Alternative, prior: Cam
         return found
     if prior is not None:
         excess = other.excess + _cost_of_turn(second.pose, prior) - _cost_of_turn(found.pose, prior)
-        return replace(found if excess > 0.0 else second, settled=abs(excess) > DECISIVE)
+        likelier, less_likely = (found, second) if excess > 0.0 else (second, found)
+        if abs(excess) > DECISIVE:
+            return likelier
+        apart = difference(less_likely.pose.T_map_camera, likelier.pose.T_map_camera)
+        return _with_spread(likelier, of_single_error(apart, math.sqrt(1.0 / (1.0 + math.exp(0.5 * abs(excess))))))
     chi2 = frame.fit.costs(np.stack([found.pose.T_map_camera, second.pose.T_map_camera]))
     chi2 *= decision_weights(frame.sight.noise_px, frame.model).min()
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
