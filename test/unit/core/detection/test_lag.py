@@ -123,7 +123,7 @@ def test_what_an_acceleration_leaves_of_the_lag_is_the_mean_of_the_young_respons
 
 def wrong_lag(lag_blur_px):
     """What is wrong with the lag, of a twist that is known."""
-    return of_motion_blur(np.ones((1, 4, 2, 6)), np.eye(6), lag_blur_px)
+    return of_motion_blur(np.ones((1, 4, 2, 6)), np.eye(6), lag_blur_px, displayed=False)
 
 
 def test_a_wrong_lag_leaves_the_common_shift_out():

@@ -49,6 +49,9 @@ OF_GRADIENT_PX2, GRADIENT_AS_CONTRAST_PX = 2.0, 2.0
 #: the motion blur. Rendered frames of a lag in steps, and of one of 14 ms taken for 10: corners with 2 to 8 px of blur
 #: are displaced by 0.010 to 0.014 of it, along the motion and across.
 OF_LAG, OF_LAG_FORM = 0.35, 0.014
+#: The latter in pictures for a display, whose gray scale is known to 1 to 3 % of the contrast: lag tails that are wrong
+#: by so much displace corners by about as large a share of the blur.
+OF_DISPLAYED_LAG_FORM = 0.03
 #: Displacement of a corner by motion blur that is not modelled [px], over the residuals that it leaves [contrasts], and
 #: the residuals beyond which they hardly grow with it. Measured: 0.015 at rest, 0.05 at 1.5 px of blur, 0.08 at 6 px.
 BLUR_THAT_SHOWS, BLURRED_OUT = 20.0, 0.055
@@ -59,7 +62,9 @@ READABLE_CELLS = 0.4
 _EYE = np.eye(2)
 
 
-def of_motion_blur(by_twist: FloatArray, twist_covariance: FloatArray, lag_blur_px: FloatArray) -> FloatArray:
+def of_motion_blur(
+    by_twist: FloatArray, twist_covariance: FloatArray, lag_blur_px: FloatArray, *, displayed: bool
+) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] of corners that are freed of their motion blur.
 
     A wrong twist displaces them, and a wrong time constant along their blur. What they have in common no marker shows,
@@ -71,12 +76,14 @@ def of_motion_blur(by_twist: FloatArray, twist_covariance: FloatArray, lag_blur_
     by_twist : (N, 4, 2, 6) derivative of the blur by the twist [px]
     twist_covariance : (6, 6)
     lag_blur_px : (N, 4, 2)
+    displayed : whether in a picture for a display
     """
     of_shape = by_twist - by_twist.mean(axis=1, keepdims=True)
     unknown = of_shape @ twist_covariance @ of_shape.swapaxes(-1, -2)
     common = lag_blur_px.mean(axis=1, keepdims=True)
     change = OF_LAG * (lag_blur_px - common)
-    form = OF_LAG_FORM**2 * (common * common).sum(axis=-1)[..., None, None] * _EYE
+    of_form = OF_DISPLAYED_LAG_FORM if displayed else OF_LAG_FORM
+    form = of_form**2 * (common * common).sum(axis=-1)[..., None, None] * _EYE
     return np.asarray(unknown + change[..., :, None] * change[..., None, :] + form)
 
 

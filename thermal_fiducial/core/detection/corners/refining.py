@@ -209,7 +209,7 @@ def _at_stamp(
     lag_blur = places.lag_blur(twist, frame.lag)
     rolling = rolling_displacement(places, twist, frame, (refined.corners_px + blur.removed)[..., 1])
     px = refined.corners_px - lag_blur + blur.removed - rolling
-    unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur)
+    unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur, displayed=frame.displayed)
     if frame.twist is None:
         unknown = unknown + _of_unpredicted_motion(frame, places, refined, twist, cells)
     corners = replace(refined, corners_px=px, covariances=doubted + unknown)

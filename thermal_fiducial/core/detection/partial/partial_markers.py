@@ -212,7 +212,8 @@ def _pose_covariance(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> Floa
     if frame.twist is not None:
         places = places_of_points(se3.apply(T, window), frame.camera)
         lag_blur, twist_covariance = places.lag_blur(frame.twist, frame.lag), frame.twist.covariance
-        blocks = blocks + of_motion_blur(frame.lag * places.flow, twist_covariance, lag_blur)[0]
+        by_twist, displayed = frame.lag * places.flow, frame.displayed
+        blocks = blocks + of_motion_blur(by_twist, twist_covariance, lag_blur, displayed=displayed)[0]
     gain = np.linalg.pinv(J).reshape(6, 4, 2)
     systematic = np.einsum('ick,ckl,jcl->ij', gain, blocks, gain)
     return np.asarray(fit.covariance + systematic)
