@@ -96,7 +96,9 @@ MECHANISMS = {
         {'located:LocatedFrame.contradicts_odometry': False},
     ),
     'odometry of keyframes': Mechanism(
-        ('chain', 'tags test_22'), (), {'keyframes:of_followed_map': lambda information, _: 1e-12 * information}
+        ('chain', 'tags test_22'),
+        (),
+        {'keyframes:information_of_followed_map': lambda information, _: 1e-12 * information},
     ),
     'bridging': Mechanism(
         ('chain', 'tags test_22'),

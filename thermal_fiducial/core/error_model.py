@@ -101,7 +101,7 @@ def noise_factor(chi2: float, freedom: int) -> float:
     return max(1.0, chi2 / max(freedom, 1))
 
 
-def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
+def covariance_of_one_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
     """Covariance (m, m) by one scalar error with derivative ``moved`` (m,): clock offset, or the other pose.
 
     Parameters
@@ -172,7 +172,7 @@ def assumed_draws(positions: FloatArray, covariances: FloatArray, placed: BoolAr
 
 def draws_of(covariance: FloatArray, rng: np.random.Generator, inherited: FloatArray = NO_DRAWS) -> FloatArray:
     """Draws (6, K) of an error of just this ``covariance``, with as much of the ``inherited`` ones as it allows."""
-    root = root_of(covariance)
+    root = covariance_root(covariance)
     whitened = np.linalg.pinv(root, _LEAST_STD) @ inherited / np.sqrt(DRAWS)
     axes, stds, shared = np.linalg.svd(whitened, full_matrices=False)
     stds = np.minimum(stds, 1.0)[:, None]
@@ -191,12 +191,12 @@ def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
 # Errors that many poses have in common.
 
 
-def of_correlated_poses(covariance: FloatArray) -> FloatArray:
+def covariance_of_correlated_poses(covariance: FloatArray) -> FloatArray:
     """Covariance (6, 6) of one of many successive poses by two cameras, as if they were independent."""
     return CORRELATED_POSES * covariance
 
 
-def of_followed_map(information: FloatArray, bridges: BoolArray) -> FloatArray:
+def information_of_followed_map(information: FloatArray, bridges: BoolArray) -> FloatArray:
     """Information (F, 6, 6) of keyframes by odometry that follows poses in the map: all count as one measurement.
 
     They have the errors of the map and of the corners behind those poses in common. With the usual correlation of
@@ -266,30 +266,30 @@ def drawn_sum(gains: FloatArray, draws: FloatArray) -> FloatArray:
     return np.asarray(np.tensordot(gains, draws, axes=([0, 2], [0, 1])))
 
 
-def of_independent_corners(covariances: FloatArray) -> FloatArray:
+def block_diagonal(covariances: FloatArray) -> FloatArray:
     """Covariances (N, 8, 8) of the corners of N markers by those of each corner (N, 4, 2, 2)."""
     whole = np.zeros((len(covariances), 8, 8))
-    of_each_corner(whole)[...] = covariances
+    diagonal_blocks(whole)[...] = covariances
     return whole
 
 
-def of_each_corner(matrices: FloatArray) -> FloatArray:
+def diagonal_blocks(matrices: FloatArray) -> FloatArray:
     """The blocks (N, 4, 2, 2) on the diagonals of (N, 8, 8): a view."""
     return np.asarray(np.einsum('nkikj->nkij', matrices.reshape(-1, 4, 2, 4, 2)))
 
 
-def covariance_of(draws: FloatArray) -> FloatArray:
+def covariance_by_draws(draws: FloatArray) -> FloatArray:
     """Covariances (..., m, m) of draws (..., m, K) of errors whose mean is zero."""
     return np.asarray(draws @ np.swapaxes(draws, -1, -2) / draws.shape[-1])
 
 
-def positive(covariances: FloatArray) -> FloatArray:
+def nearest_semidefinite(covariances: FloatArray) -> FloatArray:
     """The nearest positive semidefinite matrices (..., 6, 6)."""
-    root = root_of(covariances)
+    root = covariance_root(covariances)
     return np.asarray(root @ np.swapaxes(root, -1, -2))
 
 
-def root_of(covariances: FloatArray) -> FloatArray:
+def covariance_root(covariances: FloatArray) -> FloatArray:
     """Roots R (..., 6, 6) of covariances R R', of the nearest positive semidefinite ones."""
     values, vectors = np.linalg.eigh(0.5 * (covariances + np.swapaxes(covariances, -1, -2)))
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])

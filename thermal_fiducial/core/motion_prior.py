@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import of_single_error, positive
+from thermal_fiducial.core.error_model import covariance_of_one_error, nearest_semidefinite
 from thermal_fiducial.core.geometry.reprojection import lever_arm, turned
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import CameraPose, Odometry
@@ -151,7 +151,7 @@ def extrapolated(
     R, J = T_map_body[:3, :3], lever_arm(T_map_body[:3, :3] @ T_body_camera[:3, 3])
     covariance = J @ odometry.pose_covariance @ J.T
     velocity = J @ np.concatenate([R @ odometry.velocity_body, R @ odometry.angular_velocity_body])
-    covariance += of_single_error(velocity, clock_std)
+    covariance += covariance_of_one_error(velocity, clock_std)
     return PredictedCamera(CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), odometry, velocity)
 
 
@@ -162,5 +162,5 @@ def displacement_covariance(first: CameraPose, predicted: PredictedCamera) -> Fl
     the velocity, constant over that time.
     """
     seconds = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS
-    bounds = positive(predicted.pose.covariance - first.covariance), predicted.of_velocity(seconds)
+    bounds = nearest_semidefinite(predicted.pose.covariance - first.covariance), predicted.of_velocity(seconds)
     return min(bounds, key=lambda covariance: float(np.trace(covariance)))

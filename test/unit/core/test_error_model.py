@@ -10,7 +10,7 @@ from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import (
     arms_of_scale,
     assumed_draws,
-    covariance_of,
+    covariance_by_draws,
     drawn_sum,
     DRAWS,
     scale_of_map,
@@ -118,7 +118,7 @@ def test_a_rigid_error_of_the_map_is_that_of_the_camera():
     arms = np.random.default_rng(2).normal(size=(5, 3))
     common, A = np.diag([1e-3] * 3 + [1e-2] * 3) ** 2, by_arms(arms)
     draws = assumed_draws(arms, A @ common @ np.swapaxes(A, -1, -2), np.ones(5, dtype=bool))
-    of_pose = covariance_of(drawn_sum(0.2 * np.linalg.inv(A), draws))
+    of_pose = covariance_by_draws(drawn_sum(0.2 * np.linalg.inv(A), draws))
     # To rounding, of roots of matrices whose condition is 1e4.
     np.testing.assert_allclose(of_pose, common, rtol=1e-6, atol=1e-6 * common.max())
 
@@ -129,7 +129,7 @@ def test_assumed_draws_have_the_covariances_of_the_file():
     A = 1e-3 * rng.normal(size=(20, 6, 6))
     positions, covariances = 10.0 * rng.normal(size=(20, 3)), A @ np.swapaxes(A, -1, -2)
     covariances[10:] = np.diag([1e-3] * 3 + [1e-2] * 3) ** 2
-    found = covariance_of(assumed_draws(positions, covariances, np.arange(20) % 3 > 0))
+    found = covariance_by_draws(assumed_draws(positions, covariances, np.arange(20) % 3 > 0))
     # To rounding: covariances are up to 1e-4, and down to 1e-6 of their largest one their roots are inverted.
     np.testing.assert_allclose(found, covariances, rtol=1e-6, atol=1e-12)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.walls import CAMERA
 
-from thermal_fiducial.core.error_model import covariance_of, DRAWS, SystematicErrors
+from thermal_fiducial.core.error_model import covariance_by_draws, DRAWS, SystematicErrors
 from thermal_fiducial.core.lens_errors import LensErrors
 
 ERRORS = SystematicErrors(corner_px=0.2)
@@ -29,7 +29,7 @@ def test_draws_have_the_covariance_of_the_error_model(width, height):
     # quite uncorrelated: four standard deviations, of directions of 64 out of that many dimensions.
     tolerance = 0.03 + 4.0 * np.sqrt(max(1.0 / DRAWS - 1.0 / modes, 0.0))
     for axis in (0, 1):
-        assert np.abs(covariance_of(draws[:, axis]) - expected).max() < tolerance * ERRORS.corner_px**2
+        assert np.abs(covariance_by_draws(draws[:, axis]) - expected).max() < tolerance * ERRORS.corner_px**2
 
 
 @pytest.mark.parametrize(('width', 'height'), [(640, 512), (160, 120), (576, 576)])

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import INCONSISTENT_PX, of_single_error
+from thermal_fiducial.core.error_model import covariance_of_one_error, INCONSISTENT_PX
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
@@ -79,7 +79,7 @@ def settled(
     one, other = fit(sight.only(nearer)), fit(sight.only(~nearer))
     if isinstance(one, Refusal) or isinstance(other, Refusal):
         return contradicting(sight)
-    spread = of_single_error(difference(other.pose.T_map_camera, one.pose.T_map_camera))
+    spread = covariance_of_one_error(difference(other.pose.T_map_camera, one.pose.T_map_camera))
     pose = replace(
         found.pose,
         T_map_camera=one.pose.T_map_camera,

@@ -11,9 +11,9 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import (
     arms_of_scale,
-    covariance_of,
+    covariance_by_draws,
+    covariance_root,
     DRAWS,
-    root_of,
     scale_of_map,
     shape_of_corners,
     SystematicErrors,
@@ -51,15 +51,17 @@ class ErrorSources:
         of_odometry = np.zeros_like(known[:1])
         lasting, of_held = self._lasting(errors), self.system.by_held(np.concatenate([known, of_odometry]))[:-1]
         positions = self.now.state.T_map_marker[:, :3, 3]
-        covariances = widened * self.system.covariances()[:-1] + covariance_of(lasting) + covariance_of(of_held)
+        covariances = (
+            widened * self.system.covariances()[:-1] + covariance_by_draws(lasting) + covariance_by_draws(of_held)
+        )
         covariances += scale_of_map(arms_of_scale(positions, positions[self.problem.anchors]), errors)
         return covariances, lasting + self._noise(widened) + of_held
 
     def _noise(self, widened: float) -> FloatArray:
         """(M, 6, K) by noise of corners and priors."""
         problem, roots = self.problem, np.sqrt(widened * self.weights)[:, None, None]
-        of_frame = np.sqrt(widened) * root_of(problem.odometry.weighted(self.now.camera_chi2))
-        of_marker = np.sqrt(widened) * root_of(problem.known.weighted(self.now.marker_chi2))
+        of_frame = np.sqrt(widened) * covariance_root(problem.odometry.weighted(self.now.camera_chi2))
+        of_marker = np.sqrt(widened) * covariance_root(problem.known.weighted(self.now.marker_chi2))
 
         def sides(_: slice) -> RightSides:
             of_views = roots * self._normal(len(roots), 8)

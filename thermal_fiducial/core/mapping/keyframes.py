@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import (
     divided_prior,
     draws_of,
-    of_followed_map,
+    information_of_followed_map,
     SystematicErrors,
 )
 from thermal_fiducial.core.geometry.camera import Camera
@@ -72,7 +72,7 @@ def snapshot_of(
         np.stack([frame.T_map_camera for frame in frames]),
         tuple(cameras.values()),
         np.array([places[id(frame.camera)] for frame in frames]),
-        Priors(np.stack([frame.T_odometry for frame in frames]), of_followed_map(information, bridges)),
+        Priors(np.stack([frame.T_odometry for frame in frames]), information_of_followed_map(information, bridges)),
         np.repeat(np.arange(len(frames)), [len(frame.ids) for frame in frames]),
         np.concatenate([frame.ids for frame in frames]),
         np.concatenate([frame.corners for frame in frames]),

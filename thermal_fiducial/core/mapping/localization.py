@@ -10,15 +10,15 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.error_model import (
-    covariance_of,
+    block_diagonal,
+    covariance_by_draws,
+    covariance_of_one_error,
     decision_weights,
+    diagonal_blocks,
     drawn_sum,
     map_weights,
     noise_factor,
     noise_of_pose,
-    of_each_corner,
-    of_independent_corners,
-    of_single_error,
     survey_for_weights,
     SystematicErrors,
 )
@@ -110,7 +110,7 @@ def _widened(found: Location, other: _Alternative) -> Location:
     apart, covariance = difference(other.T_map_camera, found.pose.T_map_camera), found.pose.covariance
     expected = float(apart @ np.linalg.solve(covariance, apart))
     share = max(math.exp(-0.5 * other.excess) - math.exp(-0.5 * expected), 0.0)
-    return _with_spread(found, of_single_error(apart, math.sqrt(share)))
+    return _with_spread(found, covariance_of_one_error(apart, math.sqrt(share)))
 
 
 def _with_spread(found: Location, spread: FloatArray) -> Location:
@@ -132,7 +132,9 @@ def _either(frame: '_JointFit', found: Location, other: _Alternative, prior: Cam
         if abs(excess) > DECISIVE:
             return likelier
         apart = difference(less_likely.pose.T_map_camera, likelier.pose.T_map_camera)
-        return _with_spread(likelier, of_single_error(apart, math.sqrt(1.0 / (1.0 + math.exp(0.5 * abs(excess))))))
+        return _with_spread(
+            likelier, covariance_of_one_error(apart, math.sqrt(1.0 / (1.0 + math.exp(0.5 * abs(excess)))))
+        )
     chi2 = frame.fit.costs(np.stack([found.pose.T_map_camera, second.pose.T_map_camera]))
     chi2 *= decision_weights(frame.sight.noise_px, frame.model).min()
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
@@ -227,7 +229,7 @@ class _JointFit:
         of_scales = np.stack([model.marker_size_std * of_scale, model.focal_length_std * of_focal], axis=-1)
         of_map = of_scales @ of_scales.T
         if np.any(sight.map_covariances):
-            of_map += covariance_of(drawn_sum(map_gains, sight.draws))
+            of_map += covariance_by_draws(drawn_sum(map_gains, sight.draws))
         covariance = white + lens.covariance(by_corner) + of_map
         if not np.all(np.isfinite(covariance)):
             return None
@@ -297,12 +299,12 @@ class _SurveyedFit(_JointFit):
         """As of any fit; a corner is an outlier by what the others of its marker leave of it."""
         residuals, of_corners = seen.residuals.reshape(-1, 8, 1), self.sight.observed.covariances
         of_survey = survey_for_weights(self._of_survey(seen), self.sight.noise_px, self.model)
-        information = weights[:, None, None] * np.linalg.inv(of_survey + of_independent_corners(of_corners))
+        information = weights[:, None, None] * np.linalg.inv(of_survey + block_diagonal(of_corners))
         weighted = information @ residuals
-        pulls, of_each = weighted.reshape(-1, 4, 2, 1), of_each_corner(information)
+        pulls, of_each = weighted.reshape(-1, 4, 2, 1), diagonal_blocks(information)
         squared = (pulls * (inverse_2x2(of_each) @ pulls)).sum(axis=(-2, -1))
         excess = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
-        robust = weights[:, None, None] * np.linalg.inv(of_survey + of_independent_corners(of_corners * excess))
+        robust = weights[:, None, None] * np.linalg.inv(of_survey + block_diagonal(of_corners * excess))
         return np.asarray((robust @ seen.J_camera).reshape(-1, 6)), float((residuals * weighted).sum())
 
     def _of_survey(self, seen: Reprojected) -> FloatArray:

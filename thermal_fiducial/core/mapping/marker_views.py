@@ -7,11 +7,11 @@ from functools import cached_property
 import numpy as np
 
 from thermal_fiducial.core.error_model import (
-    covariance_of,
+    block_diagonal,
+    covariance_by_draws,
     drawn_sum,
     DRAWS,
     independent_sum,
-    of_independent_corners,
     SystematicErrors,
     with_corner_errors,
 )
@@ -145,16 +145,16 @@ class MarkerViews:
         corners = np.stack([view.corners for view in views])
         self._corners, self._of_lens = corners.reshape(-1, 8), LensErrors(corners, camera, errors)
         covariances = np.stack([view.corner_covariances for view in views])
-        self._noise = of_independent_corners(covariances)
+        self._noise = block_diagonal(covariances)
         #: with the bias of the corners, for weights and decisions
-        self._uncertain = of_independent_corners(with_corner_errors(covariances, SystematicErrors()))
+        self._uncertain = block_diagonal(with_corner_errors(covariances, SystematicErrors()))
         self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
         self._camera_noise = np.stack([view.viewpoint.covariances for view in views])
         self._scales = np.stack([view.viewpoint.scales for view in views])
         self._draws = np.stack([view.viewpoint.draws for view in views])
         # Views whose cameras have a larger error in common than others count less.
         best = np.argmin(np.sum(np.square(self._draws[:, 0]), axis=(1, 2)))
-        self._covariances = self._camera_noise + covariance_of(self._draws - self._draws[best, 0])
+        self._covariances = self._camera_noise + covariance_by_draws(self._draws - self._draws[best, 0])
         self._doubtful = any(len(view.viewpoint.poses) > 1 for view in views)
         self._chi2_of_cameras = np.stack([view.viewpoint.chi2 for view in views])
 
@@ -189,7 +189,7 @@ class MarkerViews:
         alone = independent_sum(by_corner, self._noise) + independent_sum(gains, self._camera_noise[own])
         alone *= noise
         of_noise = np.linalg.cholesky(alone) @ rng.standard_normal((6, DRAWS))
-        return alone + of_scales @ of_scales.T + covariance_of(shared), shared + of_noise
+        return alone + of_scales @ of_scales.T + covariance_by_draws(shared), shared + of_noise
 
     def _choose(self, T: FloatArray) -> IntArray:
         """The likelier of the two camera poses of each view, (S, n), for a marker at T."""

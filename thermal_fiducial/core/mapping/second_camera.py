@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.config import CHI2_OF_POSE
-from thermal_fiducial.core.error_model import of_correlated_poses, of_single_error
+from thermal_fiducial.core.error_model import covariance_of_correlated_poses, covariance_of_one_error
 from thermal_fiducial.core.frame_period import FramePeriod
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse
@@ -60,7 +60,7 @@ class SecondClock:
             walked = self._random_walk**2 * abs(stamp_ns - self._stamp_ns) / SECOND_NS
             self.variance = min(self.variance + walked, self._prior)
         self._stamp_ns = stamp_ns
-        weighted = np.linalg.solve(of_correlated_poses(covariance), velocity)
+        weighted = np.linalg.solve(covariance_of_correlated_poses(covariance), velocity)
         information = float(velocity @ weighted)
         gain = self.variance / (1.0 + self.variance * information)
         self.seconds += gain * float(weighted @ apart)
@@ -156,7 +156,7 @@ class SecondCamera:
         if moved is None:
             return None
         velocity = np.zeros(6) if middle is None else middle.velocity
-        of_clock = of_single_error(velocity, np.sqrt(self.clock.variance))
+        of_clock = covariance_of_one_error(velocity, np.sqrt(self.clock.variance))
         return replace(moved, covariance=moved.covariance + of_clock), moved, velocity
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 import numpy as np
 
-from thermal_fiducial.core.error_model import positive
+from thermal_fiducial.core.error_model import nearest_semidefinite
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
 from thermal_fiducial.core.types import FloatArray
@@ -102,7 +102,7 @@ class MapCorrections:
             # The map's error changes slowly, so the last one is used, limited to what the pose's covariance contains.
             of_map, relative = error.covariance, pose.covariance - error.covariance
             if np.linalg.eigvalsh(relative)[0] < 0.0:
-                of_map = pose.covariance - positive(relative)
+                of_map = pose.covariance - nearest_semidefinite(relative)
             pose = replace(pose, map_covariance=of_map)
         for T_new_old in self._corrections.since(pose.stamp_ns):
             pose = in_moved_map(pose, T_new_old)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.small_bag import CAMERA as STRAIGHT
 
-from thermal_fiducial.core.error_model import covariance_of, DRAWS, NO_DRAWS, SystematicErrors
+from thermal_fiducial.core.error_model import covariance_by_draws, DRAWS, NO_DRAWS, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers
@@ -104,7 +104,7 @@ def test_a_new_marker_has_the_errors_of_the_cameras_draw_by_draw():
     known, shared = placed(*[np.zeros((6, DRAWS))] * 3), placed(*[shift] * 3)
     # Cameras that are shifted alike shift the marker by as much.
     assert np.allclose(shared.draws - known.draws, shift, rtol=0.0, atol=1e-9)
-    assert np.allclose(shared.covariance - known.covariance, covariance_of(shift), rtol=0.0, atol=1e-9)
+    assert np.allclose(shared.covariance - known.covariance, covariance_by_draws(shift), rtol=0.0, atol=1e-9)
 
 
 def test_a_new_marker_has_the_errors_of_the_lens_at_its_own_corners():

@@ -8,7 +8,7 @@ import pytest
 from support.walls import CAMERA, flight, mirrored, NO_SYSTEMATIC_ERRORS, see, SIZE, wall
 from support.wrong_lenses import drawn_lens
 
-from thermal_fiducial.core.error_model import covariance_of, draws_of, SystematicErrors
+from thermal_fiducial.core.error_model import covariance_by_draws, draws_of, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
@@ -446,12 +446,12 @@ def test_draws_say_how_the_errors_of_markers_are_correlated():
     recorded = snapshot(np.random.default_rng(1), poses, sigma=0.05)
     adjusted = refine(replace(recorded, errors=SystematicErrors(marker_size_std=0.0))).markers
     for marker in adjusted.values():
-        variances = np.stack([marker.covariance.diagonal(), covariance_of(marker.draws).diagonal()])
+        variances = np.stack([marker.covariance.diagonal(), covariance_by_draws(marker.draws).diagonal()])
         # By 64 draws a variance is known to 18 %: beyond four standard deviations of its logarithm.
         assert np.abs(np.diff(np.log(variances), axis=0)).max() < 4 * 0.18
     # The markers farthest from the held one, 0, are 3 and 7 (3 m); each is 1 m from the other.
     third, seventh = (adjusted[i].draws for i in (3, 7))
-    between, alone = (covariance_of(draws)[:3, :3].trace() for draws in (third - seventh, seventh))
+    between, alone = (covariance_by_draws(draws)[:3, :3].trace() for draws in (third - seventh, seventh))
     assert between < 0.5 * alone
 
 

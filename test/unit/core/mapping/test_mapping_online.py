@@ -10,7 +10,7 @@ from support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 from support.walls import rows as rows_of
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.error_model import covariance_of
+from thermal_fiducial.core.error_model import covariance_by_draws
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
@@ -238,7 +238,7 @@ def test_drift_that_grows_with_the_way_does_not_set_neighbouring_frames_apart():
     apart = m.candidates[6].views[-1].viewpoint
     # The common error is that of 12 s and more, but for rounding. Within the 14 frames since, 1 cm/s is 5 mm, and
     # 2 mrad/s is 1 mrad.
-    assert np.all(np.diag(covariance_of(apart.draws[0]))[:3] >= (1.0 - 1e-9) * (0.05 * 12.0) ** 2)
+    assert np.all(np.diag(covariance_by_draws(apart.draws[0]))[:3] >= (1.0 - 1e-9) * (0.05 * 12.0) ** 2)
     assert np.all(np.sqrt(np.diag(apart.covariances[0])) < [0.005] * 3 + [0.001] * 3)
 
 
