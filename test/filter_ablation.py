@@ -78,7 +78,7 @@ MECHANISMS = {
     ),
     'smaller error of the map': Mechanism(
         ('map in the making',),
-        ('pose_noise:BodyPose.map_error_left', 'update:by_map'),
+        ('pose_noise:BodyPose.map_error_left', 'update:map_jacobian'),
         {'pose_noise:BodyPose.map_error_left': lambda *_: np.zeros((6, 6))},
     ),
     'size of white errors is learned': Mechanism(
@@ -90,7 +90,9 @@ MECHANISMS = {
         ('jittering',),
         off={'pose_noise:LIMITS': _limits_with(1, PoseEkfConfig().stamp_jitter ** 2)},
     ),
-    'vibration of the mount': Mechanism(('shaking mount',), ('update:by_mount',), changes={'mount_vibration': 0.0}),
+    'vibration of the mount': Mechanism(
+        ('shaking mount',), ('update:mount_jacobian',), changes={'mount_vibration': 0.0}
+    ),
     'scale of the gyroscope': Mechanism(('scale errors',), changes={'gyroscope_scale_std': 0.0}),
     'scale of the accelerometer': Mechanism(('scale errors',), changes={'accelerometer_scale_std': 0.0}),
     'floor of the vibration': Mechanism(('shaken',), ('imu_noise:NoiseFloor',), changes={'vibration': 0.0}),

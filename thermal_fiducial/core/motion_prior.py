@@ -115,7 +115,7 @@ class PredictedCamera:
     #: (6,) of the camera in the map [m/s, rad/s]
     velocity: FloatArray
 
-    def of_velocity(self, seconds: float) -> FloatArray:
+    def velocity_covariance(self, seconds: float) -> FloatArray:
         """Covariance (6, 6) of the displacement in ``seconds`` by a constant error of the velocity."""
         R = self.odometry.T_map_body[:3, :3]
         return seconds**2 * turned(self.odometry.twist_covariance, R)
@@ -162,5 +162,5 @@ def displacement_covariance(first: CameraPose, predicted: PredictedCamera) -> Fl
     the velocity, constant over that time.
     """
     seconds = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS
-    bounds = nearest_semidefinite(predicted.pose.covariance - first.covariance), predicted.of_velocity(seconds)
+    bounds = nearest_semidefinite(predicted.pose.covariance - first.covariance), predicted.velocity_covariance(seconds)
     return min(bounds, key=lambda covariance: float(np.trace(covariance)))

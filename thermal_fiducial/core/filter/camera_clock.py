@@ -67,7 +67,7 @@ class CameraClock:
         """Whether the IMU's clock may have stepped at the last jump of its stamps: no delay has shown it yet."""
         return self._imu_jump_ns != 0 and self._waited < _PATIENCE
 
-    def is_of_imu(self, step_ns: int) -> bool:
+    def is_step_of_imu(self, step_ns: int) -> bool:
         """Whether an apparent step of the camera's clock is a step of the IMU's."""
         return self._imu_jump_ns != 0 and abs(step_ns + self._imu_jump_ns) < _AGREEMENT_NS
 

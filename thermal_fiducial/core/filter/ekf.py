@@ -9,7 +9,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Hypothesis, PoseUpdate
 from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid, SMALLEST_STEP_NS
 from thermal_fiducial.core.filter.history import History
-from thermal_fiducial.core.filter.hypotheses import is_of_unknown_clock, KNOWN_OFFSET_STD
+from thermal_fiducial.core.filter.hypotheses import KNOWN_OFFSET_STD, passes_with_unknown_clock
 from thermal_fiducial.core.filter.imu_input import CLOCK_EVIDENCE, ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
 from thermal_fiducial.core.filter.output import condition_of, figures_of, in_corrected_map, odometry
@@ -161,7 +161,7 @@ class PoseEkf:
             self._allow_for_step(abs(step_ns))
             return pose, 0
         restamped = replace(pose, stamp_ns=pose.stamp_ns - step_ns)
-        if clock.is_of_imu(step_ns):
+        if clock.is_step_of_imu(step_ns):
             # Since the step the state was propagated over time that did not pass.
             clock.follow(step_ns)
             self._begin_after_jump()
@@ -209,7 +209,7 @@ class PoseEkf:
         innovation = self._history.compared(pose)
         if innovation is None or self._unusable(pose, self._camera_clock.suspects):
             return False
-        return is_of_unknown_clock(self._config, innovation)
+        return passes_with_unknown_clock(self._config, innovation)
 
     # --- output ---------------------------------------------------------------------------------------
 

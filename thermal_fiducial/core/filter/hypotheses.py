@@ -62,7 +62,7 @@ def contradiction(config: PoseEkfConfig, hypothesis: Hypothesis, innovation: Inn
     )
 
 
-def is_of_unknown_clock(config: PoseEkfConfig, innovation: Innovation) -> bool:
+def passes_with_unknown_clock(config: PoseEkfConfig, innovation: Innovation) -> bool:
     """Whether a pose passes the gate once the clock offset is treated as unknown."""
     covariance = with_unknown_clock(config, innovation.estimate.covariance)
     return with_covariance(config, innovation, covariance).nis <= config.gate
@@ -104,7 +104,7 @@ def alternative_to(
     window : (N, 6) the latest samples up to the pose's instant
     """
     estimate = innovation.estimate
-    if not is_of_unknown_clock(config, innovation):
+    if not passes_with_unknown_clock(config, innovation):
         known = math.hypot(estimate.std(TIME_OFFSET), KNOWN_OFFSET_STD)
         config = replace(config, time_offset_std=min(config.time_offset_std, known))
     begun = start(config, innovation.pose, estimate.stamp_ns, estimate.state, window)

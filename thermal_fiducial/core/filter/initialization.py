@@ -16,13 +16,13 @@ from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
     ACCELEROMETER_MATRIX,
+    clock_offset_derivative,
     Estimate,
     EXTRINSICS,
     GRAVITY,
     GYROSCOPE_BIAS,
     GYROSCOPE_MATRIX,
     NavigationState,
-    of_clock,
     POSE,
     POSITION,
     SIZE,
@@ -117,7 +117,7 @@ def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatA
 
     The first pose measures the state at the camera's stamp, X(t + s) = X(t) Exp(derivative s).
     """
-    error = of_clock(state.derivative(imu))
+    error = clock_offset_derivative(state.derivative(imu))
     covariance = np.outer(error, error)
     # Second order: clock offset times the unknown velocity.
     covariance[POSITION, POSITION] += np.eye(3) * config.initial_velocity_std**2

@@ -151,7 +151,7 @@ class Estimate:
         imu : (6,) the sample before it
         std : standard deviation of the step [s]
         """
-        error = of_clock(self.state.derivative(imu))
+        error = clock_offset_derivative(self.state.derivative(imu))
         return replace(self, covariance=self.covariance + std**2 * np.outer(error, error))
 
     def after_clock_steps(self, imu: FloatArray, std: float) -> 'Estimate':
@@ -159,7 +159,7 @@ class Estimate:
 
         ``imu`` (6,): the latest sample.
         """
-        error = of_core(self.state.derivative(imu))
+        error = embedded_core(self.state.derivative(imu))
         return replace(self, covariance=self.covariance + std**2 * np.outer(error, error))
 
     def std(self, place: slice | int) -> float:
@@ -173,19 +173,19 @@ class Estimate:
         return math.hypot(self.std(POSITION), math.sqrt(float(of_map.trace())))
 
 
-def of_core(error: FloatArray) -> FloatArray:
+def embedded_core(error: FloatArray) -> FloatArray:
     """Error coordinates (48,) with the given core (9,), zero elsewhere."""
     whole = np.zeros(SIZE)
     whole[CORE] = error
     return whole
 
 
-def of_clock(derivative: FloatArray) -> FloatArray:
+def clock_offset_derivative(derivative: FloatArray) -> FloatArray:
     """(48,) error by 1 s of clock offset with which the state at the camera's stamps is right.
 
     ``derivative`` (9,): of the core, :meth:`NavigationState.derivative`.
     """
-    error = of_core(-derivative)
+    error = embedded_core(-derivative)
     error[TIME_OFFSET] = 1.0
     return error
 

@@ -11,13 +11,13 @@ from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
 from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_that_stays
 from thermal_fiducial.core.filter.state import (
+    clock_offset_derivative,
     CORE,
+    embedded_core,
     Estimate,
     EXTRINSICS,
     GRAVITY,
     NavigationState,
-    of_clock,
-    of_core,
     POSE,
     POSITION,
     ROTATION,
@@ -86,12 +86,12 @@ def pose_error(state: NavigationState, T_map_body: FloatArray) -> FloatArray:
     return np.concatenate((rotation, np.linalg.solve(so3_left_jacobian(rotation), offset)))
 
 
-def by_mount(state: NavigationState) -> FloatArray:
+def mount_jacobian(state: NavigationState) -> FloatArray:
     """(6, 3) derivative of a measured pose by a rotation of the camera against the robot, about the camera [rad]."""
     return np.vstack((np.eye(3), skew(state.T_body_camera[:3, 3])))
 
 
-def by_map(state: NavigationState) -> FloatArray:
+def map_jacobian(state: NavigationState) -> FloatArray:
     """(48, 6) derivative of the state by a motion of the map: rotation and position in the robot frame [rad, m]."""
     J = np.zeros((SIZE, 6))
     J[POSE] = np.eye(6)
@@ -107,7 +107,7 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
     H = np.zeros((6, SIZE))
     H[_SIX, POSE] = 1.0
     H[:, EXTRINSICS] = H[:, SYSTEMATIC] = np.eye(6)
-    mount = by_mount(prior.state)
+    mount = mount_jacobian(prior.state)
     jitter = np.outer(derivative[POSE], derivative[POSE])
     units = np.stack((pose.shape, jitter, mount @ mount.T))
     R = prior.pose_noise.covariance(units)
@@ -165,7 +165,7 @@ def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estim
     P = estimate.covariance.copy()
     other_map = pose.map_change(last)
     if other_map > 0.0:
-        moved = by_map(estimate.state)
+        moved = map_jacobian(estimate.state)
         P += other_map * moved @ pose.map_error_left(last) @ moved.T
     stays = share_that_stays(P[SYSTEMATIC, SYSTEMATIC], most)
     kept = alike * stays
@@ -207,13 +207,13 @@ def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, inno
     """
     with_offset, motion = P[TIME_OFFSET], innovation.motion
     variance = float(with_offset[TIME_OFFSET])
-    followed = of_core(innovation.derivative - now)
+    followed = embedded_core(innovation.derivative - now)
     half = np.outer(followed, with_offset + 0.5 * variance * followed)
     noise = np.repeat((motion.rate_variance, motion.velocity_variance), 3)
     spurious = _SPURIOUS * float(innovation.S_inverse.diagonal() @ noise)
     widest = max(variance, config.time_offset_std**2)
     consistent = min(variance / max(1.0 - variance * spurious, _LEAST_KEPT), widest)
-    by_offset = of_clock(now)
+    by_offset = clock_offset_derivative(now)
     return P + half + half.T + (consistent - variance) * np.outer(by_offset, by_offset)
 
 

@@ -213,5 +213,5 @@ def moved_by_odometry(pose: CameraPose, stamp_ns: int, middle: PredictedCamera |
         return None
     seconds = (stamp_ns - pose.stamp_ns) / SECOND_NS
     there = retract(pose.T_map_camera, seconds * middle.velocity)
-    covariance = pose.covariance + middle.of_velocity(seconds)
+    covariance = pose.covariance + middle.velocity_covariance(seconds)
     return replace(pose, stamp_ns=stamp_ns, T_map_camera=there, covariance=covariance)

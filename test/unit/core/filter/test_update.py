@@ -23,10 +23,10 @@ from thermal_fiducial.core.filter.state import (
 from thermal_fiducial.core.filter.update import (
     adapted_noise,
     body_pose,
-    by_map,
-    by_mount,
     corrected,
     innovation_of,
+    map_jacobian,
+    mount_jacobian,
     pose_error,
 )
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform
@@ -306,7 +306,7 @@ def test_an_error_of_the_map_that_was_larger_is_left_in_the_estimate():
 def test_a_motion_of_the_map_moves_pose_velocity_and_gravity(estimate):
     state, step = estimate.state, 1e-6
     for column in range(6):
-        moved = state.plus(step * by_map(state)[:, column])
+        moved = state.plus(step * map_jacobian(state)[:, column])
         T = moved.T_map_body @ inverse(state.T_map_body)
         exact = state.in_moved_map(T)
         np.testing.assert_allclose(moved.velocity, exact.velocity, atol=1e-10)
@@ -401,7 +401,7 @@ def test_a_rotation_of_the_camera_against_the_robot_moves_the_pose_as_its_noise_
     measured = estimate.state.T_map_body @ turned @ inverse(T_body_camera)
     moved = pose_error(estimate.state, measured)
     # Second order of a microradian, and rounding of metres.
-    np.testing.assert_allclose(moved, by_mount(estimate.state) @ turn, atol=1e-11)
+    np.testing.assert_allclose(moved, mount_jacobian(estimate.state) @ turn, atol=1e-11)
 
 
 @pytest.mark.parametrize('accepted', [True, False])
@@ -410,7 +410,7 @@ def test_vibration_of_the_mount_is_learned(estimate, still, accepted):
     parameters, rng = config(systematic_pose_std=0.01, estimate_time_offset=False), np.random.default_rng(10)
     R, noise, state = 1e-10 * np.eye(6), PoseNoise.of(ELSEWHERE, mount_vibration=5e-4), estimate.state
     for _ in range(1000):
-        error = by_mount(state) @ rng.normal(0.0, 2e-3, 3)
+        error = mount_jacobian(state) @ rng.normal(0.0, 2e-3, 3)
         pose = BodyPose(state.T_map_body @ transform(so3_exp(error[:3]), error[3:]), R)
         innovation = innovation_of(parameters, replace(known(estimate, 1e-14), pose_noise=noise), pose, still)
         noise = corrected(parameters, innovation).pose_noise if accepted else adapted_noise(innovation)
