@@ -78,10 +78,10 @@ class Snapshot:
         number = np.bincount(self.frame[of_map], minlength=len(self.stamps_ns))
         has_odometry: BoolArray = np.asarray(self.odometry.information.any(axis=(1, 2)))
         useful = of_map & ((number >= 2) | has_odometry)[self.frame]
-        seen = np.unique(self.ids[useful])
-        held = self.held(seen)
+        marker_ids = np.unique(self.ids[useful])
+        held = self.held(marker_ids)
         by_odometry = has_odometry[self.frame]
-        reached = np.isin(self.ids, [*seen[held], *self.known])
+        reached = np.isin(self.ids, [*marker_ids[held], *self.known])
         while True:
             joined = useful & np.isin(self.frame, self.frame[useful & reached])
             # Odometry connects all frames that have it, but with the map only where one of them is.
@@ -176,16 +176,16 @@ class MapProblem:
     def build(cls, snapshot: Snapshot) -> 'MapProblem | None':
         """The problem of a snapshot; None if there is nothing to adjust."""
         views = snapshot.useful()
-        seen, marker = np.unique(snapshot.ids[views], return_inverse=True)
+        marker_ids, marker = np.unique(snapshot.ids[views], return_inverse=True)
         frames, frame = np.unique(snapshot.frame[views], return_inverse=True)
-        markers = [snapshot.markers[key] for key in seen.tolist()]
-        held = snapshot.held(seen)
+        markers = [snapshot.markers[key] for key in marker_ids.tolist()]
+        held = snapshot.held(marker_ids)
         if np.all(held):
             return None
         T_map_marker = np.stack([m.T_map_marker for m in markers])
         return cls(
             start=Poses(snapshot.T_map_camera[frames], T_map_marker),
-            ids=seen.tolist(),
+            ids=marker_ids.tolist(),
             stamps=snapshot.stamps_ns[frames].tolist(),
             sizes=np.array([m.size for m in markers]),
             held=held,
@@ -197,7 +197,7 @@ class MapProblem:
             corners=snapshot.corners[views],
             W=whitening(snapshot.covariances[views]),
             odometry=Priors(snapshot.odometry.T[frames], snapshot.odometry.information[frames]),
-            known=_known(snapshot, seen, T_map_marker),
+            known=_known(snapshot, marker_ids, T_map_marker),
         )
 
     def evaluate(self, state: Poses) -> Linearised:

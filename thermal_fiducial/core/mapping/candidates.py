@@ -140,7 +140,7 @@ class NewMarkers:
         self._camera: Camera | None = None
 
     def show(
-        self, stamp_ns: int, seen: Observations, camera: Camera, viewpoint: Viewpoint, errors: SystematicErrors
+        self, stamp_ns: int, observed: Observations, camera: Camera, viewpoint: Viewpoint, errors: SystematicErrors
     ) -> tuple[list[MapMarker], dict[int, str]]:
         """Add a frame's views to the candidates, except markers without a pose.
 
@@ -154,11 +154,13 @@ class NewMarkers:
                 candidate.views = [view.in_pixels_of(self._camera, camera) for view in candidate.views]
         self._camera = camera
         shown = []
-        posed = np.isfinite(seen.branches[:, 0]).all(axis=(1, 2))
-        for i, marker_id in zip(np.flatnonzero(posed).tolist(), seen.ids[posed].tolist(), strict=True):
+        posed = np.isfinite(observed.branches[:, 0]).all(axis=(1, 2))
+        for i, marker_id in zip(np.flatnonzero(posed).tolist(), observed.ids[posed].tolist(), strict=True):
             size = self._sizes.get(marker_id, self._size)
             candidate = self.candidates.setdefault(marker_id, Candidate(marker_id, size))
-            candidate.add(MarkerView(stamp_ns, viewpoint, seen.corners[i], seen.covariances[i], seen.branches[i]))
+            candidate.add(
+                MarkerView(stamp_ns, viewpoint, observed.corners[i], observed.covariances[i], observed.branches[i])
+            )
             shown.append(candidate)
         placed = []
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:

@@ -51,10 +51,10 @@ _FORGOTTEN_NS = 60 * SECOND_NS
 
 def are_two_that_contradict(location: Location) -> bool:
     """Whether the pose comes from two markers of which it does not fit at least one."""
-    sight, seen = location.sight, location.seen
+    sight, reprojection = location.sight, location.reprojection
     if len(sight.markers) != 2:
         return False
-    return bool(np.any(seen.errors_px > DISAGREEMENT * error_std_px(sight, seen, np.zeros((6, 6)))))
+    return bool(np.any(reprojection.errors_px > DISAGREEMENT * error_std_px(sight, reprojection, np.zeros((6, 6)))))
 
 
 def settled(
@@ -275,11 +275,11 @@ def _is_back(misplaced: MisplacedMarker, pose: CameraPose, predicted: PredictedC
 
 def _distances(sight: Sight, camera: Camera, predicted: CameraPose) -> FloatArray:
     """Squared Mahalanobis distances (N,), eight degrees of freedom, of N markers from where odometry predicts them."""
-    seen = sight.reprojected(camera, predicted.T_map_camera)
+    reprojection = sight.reprojected(camera, predicted.T_map_camera)
     # A marker predicted behind the camera is not there.
-    residuals = np.nan_to_num(seen.residuals, nan=float(camera.width)).reshape(-1, 8)
-    of_camera = seen.J_camera @ predicted.covariance @ np.swapaxes(seen.J_camera, 1, 2)
-    of_map = seen.J_marker @ sight.map_covariances @ np.swapaxes(seen.J_marker, 1, 2)
+    residuals = np.nan_to_num(reprojection.residuals, nan=float(camera.width)).reshape(-1, 8)
+    of_camera = reprojection.J_camera @ predicted.covariance @ np.swapaxes(reprojection.J_camera, 1, 2)
+    of_map = reprojection.J_marker @ sight.map_covariances @ np.swapaxes(reprojection.J_marker, 1, 2)
     own = (2.0 * sight.noise_px**2 + INCONSISTENT_PX**2)[:, None, None] * np.eye(8)
     weighted = np.linalg.solve(np.nan_to_num(of_camera + of_map) + own, residuals[..., None])[..., 0]
     return np.asarray((residuals * weighted).sum(axis=1))

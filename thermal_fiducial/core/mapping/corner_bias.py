@@ -58,7 +58,7 @@ class CornerBias:
         then = [places[location.pose.marker_ids[place]] for place in now]
         if len(now) < FEWEST_MARKERS:
             return
-        residuals, former = location.seen.residuals[now], last.seen.residuals[then]
+        residuals, former = location.reprojection.residuals[now], last.reprojection.residuals[then]
         products = (residuals * former).sum(axis=(1, 2)) / 8.0
         of_shape = products - (residuals.mean(axis=1) * former.mean(axis=1)).sum(axis=1) / 2.0
         of_shape = np.clip(of_shape / (noise[now] * last.sight.noise_px[then]), -LARGEST_SHAPE, LARGEST_SHAPE)
@@ -69,7 +69,7 @@ class CornerBias:
         weights, scale = (np.repeat(np.sqrt(values), 4)[:, None] for values in (shares, shares * bound))
         modes = weights * location.lens.modes[now].reshape(len(weights), -1)
         shown = shown_errors(
-            weights[..., None] * location.seen.J_camera[now].reshape(-1, 2, 6),
+            weights[..., None] * location.reprojection.J_camera[now].reshape(-1, 2, 6),
             modes @ modes.T,
             scale * residuals.reshape(-1, 2),
             scale * former.reshape(-1, 2),

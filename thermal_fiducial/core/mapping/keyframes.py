@@ -154,20 +154,20 @@ class KeyframeStore:
             kept = self._spread(int(_THINNED * self._budget))
             self.frames = {stamp: frame for stamp, frame in self.frames.items() if stamp in kept}
 
-    def keep(self, seen: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
+    def keep(self, observed: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
         """Keep a frame with a known camera pose and at least two markers."""
         self._last_ns, self._gap = pose.stamp_ns, None
-        if len(seen.ids) >= 2:
-            self.add(self._keyframe(seen, pose, camera, predicted))
+        if len(observed.ids) >= 2:
+            self.add(self._keyframe(observed, pose, camera, predicted))
 
-    def bridge(self, seen: Observations, camera: Camera, predicted: PredictedCamera, *, first: bool) -> Viewpoint:
+    def bridge(self, observed: Observations, camera: Camera, predicted: PredictedCamera, *, first: bool) -> Viewpoint:
         """Keep a frame without a known marker; returns the viewpoint of its markers, by odometry.
 
         Only odometry connects these markers with the map. Its error at the ``first`` of them is common to all that
         follow in the gap, since the markers connect the later frames.
         """
-        keyframe = self._keyframe(seen, predicted.pose, camera, predicted)
-        if first or len(seen.ids) >= 2:
+        keyframe = self._keyframe(observed, predicted.pose, camera, predicted)
+        if first or len(observed.ids) >= 2:
             self.add(replace(keyframe, bridge=first))
         if self._gap is None:
             self._gap = predicted.pose
@@ -204,8 +204,8 @@ class KeyframeStore:
         number = sum(len(frame.ids) for frame in frames)
         self._adjustment = LastAdjustment(next(reversed(self.frames)), len(self.frames), number, markers, self._added)
         trusted = {key: marker for key, marker in marker_map.markers.items() if marker.trusted}
-        seen = set(np.concatenate([frame.ids for frame in frames]).tolist())
-        priors = prior_poses({key: marker for key, marker in self._before.items() if key in seen})
+        observed_ids = set(np.concatenate([frame.ids for frame in frames]).tolist())
+        priors = prior_poses({key: marker for key, marker in self._before.items() if key in observed_ids})
         return snapshot_of(trusted, frames, priors, marker_map.revision, errors)
 
     def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
@@ -222,11 +222,13 @@ class KeyframeStore:
         return displacement
 
     def _keyframe(
-        self, seen: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None
+        self, observed: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None
     ) -> Keyframe:
         if self._camera is None or not camera.matches(self._camera):
             self._camera = camera
-        frame = Keyframe(pose.stamp_ns, pose.T_map_camera, self._camera, seen.ids, seen.corners, seen.covariances)
+        frame = Keyframe(
+            pose.stamp_ns, pose.T_map_camera, self._camera, observed.ids, observed.corners, observed.covariances
+        )
         if predicted is None:
             return frame
         information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)

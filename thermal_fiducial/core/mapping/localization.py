@@ -70,17 +70,17 @@ def locate(
     # Steps 3 and 4: the pose from all markers jointly, weighted by the map.
     by_map = frame.map_weights(hypotheses[0])
     T = hypotheses[0]
-    seen = sight.reprojected(camera, T)
-    if seen.shown.all():
+    reprojection = sight.reprojected(camera, T)
+    if reprojection.shown.all():
         T = fit.solve(hypotheses[:1], by_map)[0][0]
-        seen = sight.reprojected(camera, T)
-    if not (shown := seen.shown).all():
+        reprojection = sight.reprojected(camera, T)
+    if not (shown := reprojection.shown).all():
         # A marker that the camera could not show is not where the map has it. The others give the pose, if most are.
         if 2 * np.count_nonzero(shown) > len(shown):
             return locate(stamp_ns, sight.only(shown), camera, prior, model)
         return Refusal(f'no camera pose explains {names(sight)}')
     # Steps 5 and 6: refined with the weights of their errors.
-    found = frame.refined(T, seen, frame.weights(seen, by_map))
+    found = frame.refined(T, reprojection, frame.weights(reprojection, by_map))
     if found is None:
         return Refusal(f'the pose from {names(sight)} is not determined')
     other = frame.alternative(found, hypotheses)
@@ -158,11 +158,11 @@ class _JointFit:
     model: SystematicErrors
     fit: CameraFit
 
-    def weights(self, seen: Reprojected, by_map: FloatArray) -> FloatArray:
+    def weights(self, reprojection: Reprojected, by_map: FloatArray) -> FloatArray:
         """Weights (N,) of the markers ``by_map`` (N,) and by their errors."""
-        return np.asarray(by_map * marker_weights(seen.errors_px, self.sight.noise_px, self.model))
+        return np.asarray(by_map * marker_weights(reprojection.errors_px, self.sight.noise_px, self.model))
 
-    def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
+    def refined(self, T_map_camera: FloatArray, reprojection: Reprojected, weights: FloatArray) -> Location | None:
         """Gauss-Newton steps from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
 
         The linearisation of the last step, in corners, map and scale, gives the covariances. None if the markers do not
@@ -170,30 +170,30 @@ class _JointFit:
         """
         n = len(weights)
         for remaining in reversed(range(_MOST_STEPS)):
-            J = seen.J_camera.reshape(-1, 6)
-            weighted, chi2 = self._weighted(seen, weights)
+            J = reprojection.J_camera.reshape(-1, 6)
+            weighted, chi2 = self._weighted(reprojection, weights)
             information = J.T @ weighted
             try:
                 gains = np.linalg.inv(information) @ weighted.T
             except np.linalg.LinAlgError:
                 return None
-            step = gains @ seen.residuals.ravel()
+            step = gains @ reprojection.residuals.ravel()
             if remaining == 0 or step @ information @ step < _SMALL_STEP:
                 break
             T_map_camera = retract(T_map_camera, step)
-            seen = self.sight.reprojected(self.camera, T_map_camera)
-            if not np.all(np.isfinite(seen.residuals)):
+            reprojection = self.sight.reprojected(self.camera, T_map_camera)
+            if not np.all(np.isfinite(reprojection.residuals)):
                 return None
-        after = replace(seen, residuals=seen.residuals - (J @ step).reshape(n, 4, 2))
+        after = replace(reprojection, residuals=reprojection.residuals - (J @ step).reshape(n, 4, 2))
         return self._location(T_map_camera, step, gains, chi2, after, weights)
 
-    def _weighted(self, seen: Reprojected, weights: FloatArray) -> tuple[FloatArray, float]:
+    def _weighted(self, reprojection: Reprojected, weights: FloatArray) -> tuple[FloatArray, float]:
         """The Jacobian (8 N, 6) times the robust information of the corners, and chi square of their residuals."""
-        n, residuals = len(weights), seen.residuals[..., None]
+        n, residuals = len(weights), reprojection.residuals[..., None]
         information = inverse_2x2(self.sight.observed.covariances) * weights[:, None, None, None]
         squared = (residuals * (information @ residuals)).sum(axis=(-2, -1))
         robust = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
-        weighted = information / robust @ seen.J_camera.reshape(n, 4, 2, 6)
+        weighted = information / robust @ reprojection.J_camera.reshape(n, 4, 2, 6)
         return np.asarray(weighted.reshape(8 * n, 6)), float(squared.sum())
 
     def _location(
@@ -202,7 +202,7 @@ class _JointFit:
         step: FloatArray,
         gains: FloatArray,
         chi2: float,
-        seen: Reprojected,
+        reprojection: Reprojected,
         weights: FloatArray,
     ) -> Location | None:
         """The pose (4, 4) corrected by ``step`` (6,), with its covariance; None if that is not finite.
@@ -220,8 +220,8 @@ class _JointFit:
         white = noise_of_pose(by_corner, sight.observed.covariances.reshape(-1, 2, 2), chi2)
         lens = LensErrors(sight.observed.corners, self.camera, model)
         arms = sight.points - sight.T_map_marker[:, None, :3, 3]
-        grown = gains @ (seen.J_marker.reshape(n, 4, 2, 6)[..., :3] @ arms[..., None]).ravel()
-        map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ seen.J_marker
+        grown = gains @ (reprojection.J_marker.reshape(n, 4, 2, 6)[..., :3] @ arms[..., None]).ravel()
+        map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ reprojection.J_marker
         # Sides of the markers and distances in the map have the same scale error.
         of_scale = np.einsum('nij,nj->i', map_gains[:, :, :3], sight.scale_arms) - grown
         # A longer focal length moves all corners away from the principal point.
@@ -233,11 +233,11 @@ class _JointFit:
         covariance = white + lens.covariance(by_corner) + of_map
         if not np.all(np.isfinite(covariance)):
             return None
-        ids, rms_px = tuple(sight.observed.ids.tolist()), math.sqrt(seen.errors_px @ seen.errors_px / n)
+        ids, rms_px = tuple(sight.observed.ids.tolist()), math.sqrt(reprojection.errors_px @ reprojection.errors_px / n)
         T = retract(T_map_camera, step)
         pose = CameraPose(self.stamp_ns, T, covariance, of_map, ids, rms_px)
         linear_std = math.sqrt(covariance[3:, 3:].trace())
-        return Location(pose, sight, seen, weights, map_gains, lens, white, of_scales, by_corner, linear_std)
+        return Location(pose, sight, reprojection, weights, map_gains, lens, white, of_scales, by_corner, linear_std)
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> _Alternative | None:
         """The second solution of the planar ambiguity; where it merges with the first, the likeliest pose far from it.
@@ -283,11 +283,11 @@ class _SurveyedFit(_JointFit):
     With corners that count as independent, an error of the distance between two markers tilts the camera.
     """
 
-    def weights(self, seen: Reprojected, by_map: FloatArray) -> FloatArray:
+    def weights(self, reprojection: Reprojected, by_map: FloatArray) -> FloatArray:
         """As of any fit, but errors of the survey are expected, and have joint weights."""
         sight = self.sight
-        of_survey = np.diagonal(self._of_survey(seen), axis1=1, axis2=2).mean(axis=1)
-        by_errors = marker_weights(seen.errors_px, np.sqrt(sight.noise_px**2 + of_survey), self.model)
+        of_survey = np.diagonal(self._of_survey(reprojection), axis1=1, axis2=2).mean(axis=1)
+        by_errors = marker_weights(reprojection.errors_px, np.sqrt(sight.noise_px**2 + of_survey), self.model)
         return np.asarray(np.where(sight.surveyed, 1.0, by_map) * by_errors)
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> _Alternative | None:
@@ -295,21 +295,21 @@ class _SurveyedFit(_JointFit):
         by_map = np.where(self.sight.surveyed, self.map_weights(found.pose.T_map_camera), 1.0)
         return super().alternative(replace(found, weights=by_map * found.weights), hypotheses)
 
-    def _weighted(self, seen: Reprojected, weights: FloatArray) -> tuple[FloatArray, float]:
+    def _weighted(self, reprojection: Reprojected, weights: FloatArray) -> tuple[FloatArray, float]:
         """As of any fit; a corner is an outlier by what the others of its marker leave of it."""
-        residuals, of_corners = seen.residuals.reshape(-1, 8, 1), self.sight.observed.covariances
-        of_survey = survey_for_weights(self._of_survey(seen), self.sight.noise_px, self.model)
+        residuals, of_corners = reprojection.residuals.reshape(-1, 8, 1), self.sight.observed.covariances
+        of_survey = survey_for_weights(self._of_survey(reprojection), self.sight.noise_px, self.model)
         information = weights[:, None, None] * np.linalg.inv(of_survey + block_diagonal(of_corners))
         weighted = information @ residuals
         pulls, of_each = weighted.reshape(-1, 4, 2, 1), diagonal_blocks(information)
         squared = (pulls * (inverse_2x2(of_each) @ pulls)).sum(axis=(-2, -1))
         excess = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
         robust = weights[:, None, None] * np.linalg.inv(of_survey + block_diagonal(of_corners * excess))
-        return np.asarray((robust @ seen.J_camera).reshape(-1, 6)), float((residuals * weighted).sum())
+        return np.asarray((robust @ reprojection.J_camera).reshape(-1, 6)), float((residuals * weighted).sum())
 
-    def _of_survey(self, seen: Reprojected) -> FloatArray:
+    def _of_survey(self, reprojection: Reprojected) -> FloatArray:
         """Covariances (N, 8, 8) [px^2] of the corners by errors of the survey: zero of the other markers."""
-        J = np.where(self.sight.surveyed[:, None, None], seen.J_marker, 0.0)
+        J = np.where(self.sight.surveyed[:, None, None], reprojection.J_marker, 0.0)
         return np.asarray(J @ self.sight.map_covariances @ J.swapaxes(-1, -2))
 
 

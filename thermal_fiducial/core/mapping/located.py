@@ -109,7 +109,7 @@ class Location:
     pose: CameraPose
     #: the N markers of the fit, and their re-projection
     sight: Sight
-    seen: Reprojected
+    reprojection: Reprojected
     #: (N,) their weights, at most 1
     weights: FloatArray
     #: (N, 6, 6) derivative of the pose by the poses of the markers in the map
@@ -219,9 +219,11 @@ class LocatedFrame:
         That of a marker behind the camera is the image's width, and so is any larger one.
         """
         known, pose = self.known, location.pose
-        seen = location.seen if location.sight is known else known.reprojected(self.camera, pose.T_map_camera)
-        errors = np.fmin(seen.errors_px, float(self.camera.width))
-        return errors, error_std_px(known, seen, pose.covariance)
+        reprojection = (
+            location.reprojection if location.sight is known else known.reprojected(self.camera, pose.T_map_camera)
+        )
+        errors = np.fmin(reprojection.errors_px, float(self.camera.width))
+        return errors, error_std_px(known, reprojection, pose.covariance)
 
     def left_out(self, location: Location) -> BoolArray:
         """Which of the K known markers (K,) the pose left out, though they were trusted."""
@@ -234,9 +236,9 @@ def squared_distance(pose: CameraPose, predicted: CameraPose) -> float:
     return float(apart @ np.linalg.solve(pose.covariance + predicted.covariance, apart))
 
 
-def error_std_px(sight: Sight, seen: Reprojected, camera_covariance: FloatArray) -> FloatArray:
+def error_std_px(sight: Sight, reprojection: Reprojected, camera_covariance: FloatArray) -> FloatArray:
     """Standard deviations (N,) of the rms re-projection errors [px] by noise, map and a camera known to (6, 6)."""
-    by_camera = np.einsum('nri,nri->n', seen.J_camera @ camera_covariance, seen.J_camera)
-    by_marker = np.einsum('nri,nri->n', seen.J_marker @ sight.map_covariances, seen.J_marker)
+    by_camera = np.einsum('nri,nri->n', reprojection.J_camera @ camera_covariance, reprojection.J_camera)
+    by_marker = np.einsum('nri,nri->n', reprojection.J_marker @ sight.map_covariances, reprojection.J_marker)
     variances = 2.0 * sight.noise_px**2 + np.nan_to_num(by_camera + by_marker) / 4.0 + INCONSISTENT_PX**2
     return np.asarray(np.sqrt(variances))

@@ -58,7 +58,7 @@ class MapMarker:
     #: measured by itself, before any flight: its error is independent of those of all other markers
     surveyed: bool = field(default=False, compare=False, repr=False)
 
-    def seen(self, stamp_ns: int, error_px: float) -> 'MapMarker':
+    def observed(self, stamp_ns: int, error_px: float) -> 'MapMarker':
         """The marker after one more observation; without ``replace``, as this runs for every marker of every frame."""
         count = self.observations + 1
         mean_square = self.reprojection_error_px**2

@@ -187,7 +187,7 @@ class MarkerMapper:
             # Step 8: new markers placed relative to the camera.
             if not self.frozen:
                 for marker, error in zip(known, errors.tolist(), strict=True):
-                    self.map.markers[marker.id] = self.map.markers[marker.id].seen(frame.stamp_ns, error)
+                    self.map.markers[marker.id] = self.map.markers[marker.id].observed(frame.stamp_ns, error)
                 self._keyframes.keep(frame.observed, outcome.pose, frame.camera, frame.predicted)
                 if not frame.is_known.all():
                     placed, waiting = self._place_new(frame, outcome.viewpoint)

@@ -241,11 +241,11 @@ def test_the_white_covariance_of_the_pose_is_the_spread_of_its_errors(count):
 def test_the_running_error_is_the_mean_at_first_and_then_forgets():
     marker = MapMarker(0, 0.3, False, np.eye(4))
     for stamp_ns, error in ((5, 0.1), (8, 0.3)):
-        marker = marker.seen(stamp_ns, error)
+        marker = marker.observed(stamp_ns, error)
     np.testing.assert_allclose(marker.reprojection_error_px, np.sqrt((0.1**2 + 0.3**2) / 2.0))
     assert (marker.observations, marker.first_seen_ns, marker.last_seen_ns) == (2, 5, 8)
     for stamp_ns in range(10, 210):
-        marker = marker.seen(stamp_ns, 0.2)
+        marker = marker.observed(stamp_ns, 0.2)
     # 0.95^180 of the start is left.
     np.testing.assert_allclose(marker.reprojection_error_px, 0.2, rtol=1e-3)
 
