@@ -41,6 +41,17 @@ def invertible(camera):
     return bool(np.all(np.isfinite(rays)) and np.allclose(camera.project(rays), border, atol=1e-6))
 
 
+#: In the corners of its image normalised coordinates are infinite.
+FOLDED = Camera(
+    640, 512, np.array([[400.0, 0, 300], [0, 400, 250], [0, 0, 1]]), 'equidistant', [-0.140625, -0.015625, 0, 0]
+)
+
+
+def test_a_pixel_that_the_lens_does_not_show_has_no_ray_and_gives_no_warning():
+    assert not invertible(FOLDED)
+    assert np.isnan(FOLDED.rays([0.0, 0.0])).any()
+
+
 @given(cameras(), pixels, distances)
 def test_every_pixel_has_its_ray(camera, uv, distance):
     assume(invertible(camera))

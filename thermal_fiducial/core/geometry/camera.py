@@ -184,10 +184,11 @@ class Camera:
         return np.asarray(x)
 
     def rays(self, uv: npt.ArrayLike) -> FloatArray:
-        """Unit viewing directions (..., 3) of pixels (..., 2)."""
+        """Unit viewing directions (..., 3) of pixels (..., 2); not finite where the lens shows nothing."""
         x = self.normalise(uv)
         ray = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
-        return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+        with np.errstate(invalid='ignore'):
+            return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
 
     def contains(self, uv: npt.ArrayLike, margin_px: float = 0.0) -> BoolArray:
         """Whether pixels (..., 2) lie in the image, ``margin_px`` away from its border; False for NaN."""
