@@ -14,6 +14,8 @@ from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatAr
 
 # Search scales [px]; a fifth to a third of the point spacing is best.
 _SCALES = (17.0, 10.0, 5.8, 3.4, 2.0, 1.2, 0.72)
+#: Each is the next one times this.
+SCALE_RATIO = 1.7
 # Scales that are compared: perspective makes the points of a board differ in size, and a strong structure several times
 # as large as a point is another object, behind it or beside it.
 _COMPARED = 3
@@ -45,7 +47,7 @@ class Keypoints:
     hessians : (N, 3) unit vectors of Iuu, Ivv, sqrt(2) Iuv: which way a saddle lies
     response : (N,) determinant of the Hessian, free of scale
     scale : (N,) index of the search scale, from coarse to fine
-    signal : (N,) second derivative relative to its noise, at least :data:`NOISE_RATIO`
+    signal : (N,) second derivative relative to its white noise, at least :data:`NOISE_RATIO`
     alternate : whether neighbours on a board have opposite Hessians (chessboard corners) or similar ones (discs)
     """
 
@@ -126,13 +128,13 @@ def _extrema(image: Float32Array, scale: int, *, saddle: bool) -> Keypoints:
     sigma = blur / shrink
     smooth = cv2.GaussianBlur(image, (0, 0), sigma)
     smooth = np.asarray(smooth - cv2.GaussianBlur(smooth, (0, 0), _WIDE * sigma), dtype=np.float32)
-    uu, vv, uv = (np.asarray(cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.25)) for order in ((2, 0), (0, 2), (1, 1)))
+    uu, vv, uv = (
+        np.asarray(cv2.Sobel(smooth, cv2.CV_32F, *order, scale=0.25), dtype=np.float32)
+        for order in ((2, 0), (0, 2), (1, 1))
+    )
     determinant = uu * vv - uv * uv
     response = -determinant if saddle else determinant
-    # Of a normal distribution a quarter lies within 0.3186 standard deviations. White noise has three times as much
-    # variance in uu and vv as in uv; fixed-pattern noise of columns only in uu.
-    across, down, mixed = (float(np.percentile(np.abs(part), 25.0)) / 0.3186 for part in (uu, vv, uv))
-    noise = max(float(np.sqrt(across * down / 3.0)), mixed, _ROUNDING / sigma**3)
+    white, noise = (max(level, _ROUNDING / sigma**3) for level in _noise(uu, vv, uv))
     peak = (response >= cv2.dilate(response, np.ones((3, 3), np.uint8))) & (response > (NOISE_RATIO * noise) ** 2)
     peak[[0, -1]] = peak[:, [0, -1]] = False
     v, u = np.nonzero(peak)
@@ -142,10 +144,22 @@ def _extrema(image: Float32Array, scale: int, *, saddle: bool) -> Keypoints:
     hessians /= np.linalg.norm(hessians, axis=1, keepdims=True) + 1e-12
     pixels = (np.stack([u, v], axis=1) + step + 0.5) * shrink - 0.5
     strength = response[v, u].astype(np.float64) * sigma**4
-    signal = np.sqrt(response[v, u].astype(np.float64)) / noise
+    signal = np.sqrt(response[v, u].astype(np.float64)) / white
     every = Keypoints(pixels, hessians, strength, np.full(len(pixels), scale), signal, saddle)
     found = every.rows(np.flatnonzero(still))
     return found.rows(np.argsort(-found.response, kind='stable')[:_MOST_POINTS])
+
+
+def _noise(uu: Float32Array, vv: Float32Array, uv: Float32Array) -> tuple[float, float]:
+    """Standard deviation of uv, of which columns have none, and that of the determinant's root.
+
+    White noise has three times as much variance in uu and vv as in uv; fixed-pattern noise of columns is only in uu.
+    Of a normal distribution a quarter lies within 0.3186 standard deviations, a tenth within 0.1257: a board that fills
+    the image leaves fewer places without uu or vv than without uv.
+    """
+    mixed = float(np.percentile(np.abs(uv), 25.0)) / 0.3186
+    across, down = (float(np.percentile(np.abs(part), 10.0)) / 0.1257 for part in (uu, vv))
+    return mixed, max(float(np.sqrt(across * down / 3.0)), mixed)
 
 
 def _to_stationary(smooth: FloatArray, v: IntArray, u: IntArray, hessians: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial import cKDTree
 
-from thermal_fiducial.calibration.keypoints import Keypoints
+from thermal_fiducial.calibration.keypoints import Keypoints, SCALE_RATIO
 from thermal_fiducial.calibration.surface import local_surfaces, REACH
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -30,6 +30,8 @@ _STRONGER = 16.0
 # Deviation from where the grid predicts a point, in steps of the grid. Points of a board deviate by a tenth or less on
 # average, whatever the lens; those of noise by as much as is allowed.
 _TOLERANCE, _SEED_TOLERANCE, _ORDERLY, _ENOUGH = 0.3, 0.25, 0.15, 6
+# Largest difference of a point's search scale from that of its grid there: the next finer or coarser one is as good.
+_SCALES_OFF = 1.5
 # Directions of a grid's axes differ by this much (sine).
 _LEAST_SINE = 0.35
 
@@ -159,8 +161,9 @@ class Grower:
         rows = np.flatnonzero(surfaces.determined)
         radii = _TOLERANCE * np.linalg.norm(steps[rows], axis=1).max(axis=1, initial=0.0)
         nearby = self._tree.query_ball_point(surfaces.centres[rows], radii)
-        for row, near in zip(rows.tolist(), nearby, strict=True):
-            free = [index for index in near if index not in used]
+        scales = self._scales_at(grid, steps[rows])
+        for row, near, scale in zip(rows.tolist(), nearby, scales.tolist(), strict=True):
+            free = [index for index in near if index not in used and abs(self._scale[index] - scale) <= _SCALES_OFF]
             found = self._next(grid, places[row], free, surfaces.centres[row], steps[row]) if free else None
             if found is not None:
                 grid[places[row]] = found[0]
@@ -168,6 +171,13 @@ class Grower:
                 support.update(_supported(places[row]))
                 off.append(found[1])
         return len(grid) > before
+
+    def _scales_at(self, grid: dict[Node, int], steps: FloatArray) -> FloatArray:
+        """Search scales (P,) of a grid's points where its ``steps`` (P, 2, 2) are, which grow with them."""
+        ends = self.pixels[[grid[node] for node in ((1, 0), (-1, 0), (0, 1), (0, -1))]]
+        seed_area = 0.25 * abs(np.linalg.det([ends[0] - ends[1], ends[2] - ends[3]]))
+        wider = 0.5 * np.log(np.abs(np.linalg.det(steps)) / max(seed_area, 1.0))
+        return np.asarray(self._scale[grid[0, 0]] - wider / np.log(SCALE_RATIO))
 
     def _next(
         self, grid: dict[Node, int], node: Node, nearby: list[int], centre: FloatArray, steps: FloatArray
@@ -185,11 +195,10 @@ class Grower:
         return None
 
     def _fits(self, grid: dict[Node, int], node: Node, index: int) -> bool:
-        """Whether Hessian, contrast and scale are like those of a neighbour; of any sign, for contrast may reverse."""
+        """Whether Hessian and contrast are like those of a neighbour; of any sign, for contrast may reverse."""
         neighbours = next(known for reach in (1, 2) if (known := [grid[n] for n in _around(node, reach) if n in grid]))
         alike = np.abs(self._hessians[neighbours] @ self._hessians[index]) > _LIKE
         alike &= np.abs(self._strength[neighbours] - self._strength[index]) < np.log(_STRONGER)
-        alike &= np.abs(self._scale[neighbours] - self._scale[index]) <= 1
         return bool(alike.any())
 
 

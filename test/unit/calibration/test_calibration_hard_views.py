@@ -6,6 +6,7 @@ import pytest
 
 from thermal_fiducial.calibration.keypoints import saddles
 from thermal_fiducial.calibration.placement import BoardNodes
+from thermal_fiducial.calibration.recognition import BoardNotFound
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid
 
 WIDTH, HEIGHT, FOCAL, SAMPLES = 384, 288, 250.0, 3
@@ -58,9 +59,9 @@ def discs(points, radius):
     return levels
 
 
-def worst_px(found, H):
+def worst_px(found, H, board):
     """Largest distance [px] of the points found from where they are, for a board that may be turned by half a turn."""
-    points, every = found.points[:, :2], found.points[:, :2].max(axis=0)
+    points, every = found.points[:, :2], board.points[:, :2].max(axis=0)
     return min(
         np.abs(found.pixels - cv2.perspectiveTransform(np.ascontiguousarray(places)[:, None], H)[:, 0]).max()
         for places in (points, every - points)
@@ -95,7 +96,18 @@ def test_a_board_wholly_in_view_is_found(board, contrast, seed):
     # Two corners of a last row may look covered where the background is as warm as its squares.
     assert len(found.points) >= len(board.points) - 2
     # At a contrast of ten times the noise a corner has 0.1 px, on a far side of 10 px from one to the next 0.15: four.
-    assert worst_px(found, H) < 0.6
+    assert worst_px(found, H, board) < 0.6
+
+
+@pytest.mark.parametrize('seed', [101, 107])
+def test_a_frame_is_no_row_of_a_board_that_is_partly_out_of_view(seed):
+    """With points of any scale beside a seed's the frame was taken for the row that is out of view: 150 px off."""
+    board, levels = chessboard(6, 5, 0.2)
+    rng = np.random.default_rng(seed)
+    H = view(rng, board.points[:, :2])
+    H[0] += rng.uniform(80.0, 200.0) * H[2]
+    with pytest.raises(BoardNotFound, match='out of view'):
+        board.find(picture(H, levels, 60.0, rng), None)
 
 
 def test_columns_of_fixed_pattern_noise_are_no_points():
