@@ -16,6 +16,7 @@ from thermal_fiducial.calibration.sources import clean_frames, pictures, RawFram
 from thermal_fiducial.calibration.targets import Sighting, Target
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 
@@ -78,9 +79,7 @@ class BoardViews:
         total = len(self.kept) + len(self.unusable)
         reasons = Counter(reason for _, reason in self.unusable)
         named = [f'{name}: {reason}' for name, reason in self.unusable] if len(self.unusable) <= 20 else []
-        named = named or [
-            f'{count} frame{"s" if count != 1 else ""}: {reason}' for reason, count in reasons.most_common(5)
-        ]
+        named = named or [f'{number_of(count, "frame")}: {reason}' for reason, count in reasons.most_common(5)]
         text = f'{source}: {len(self.kept)} of {total} frames are usable views, a calibration needs {LEAST_VIEWS}'
         raise InputError('; '.join([text, *named]))
 

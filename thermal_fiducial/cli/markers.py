@@ -73,7 +73,7 @@ def _check(args: argparse.Namespace) -> int:
     between, own = distances(bits[ids])
     pairs = negatives(bits[ids], between)
     for a, b, apart in pairs:
-        print(f'marker {ids[a]} and the negative of {ids[b]} differ in {apart} bit{"" if apart == 1 else "s"}')
+        print(f'marker {ids[a]} and the negative of {ids[b]} differ in {number_of(apart, "bit")}')
     if pairs:
         signed = ' and '.join(sorted(path.stem for path in PACKAGED.glob('*_SIGNED.yaml')))
         print(f'only the border shows the polarity of these: set polarity, or use {signed}, which have none')

@@ -13,6 +13,7 @@ from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 from thermal_fiducial.report.run_folder import bag_of_run, Detections, Run
@@ -71,9 +72,7 @@ def strip(run: Run, bag: Path | None = None) -> list[FramePicture]:
                 drawn = annotated(view.pixels, run.detections, view.stamp_ns)
                 count = int(np.sum(stamps == view.stamp_ns))
                 seconds = (view.stamp_ns - start) / SECOND_NS
-                pictures.append(
-                    FramePicture(_uri(drawn), f'{seconds:.1f} s, {count} marker{"s" if count != 1 else ""}')
-                )
+                pictures.append(FramePicture(_uri(drawn), f'{seconds:.1f} s, {number_of(count, "marker")}'))
     return pictures
 
 
