@@ -45,6 +45,8 @@ class GrayScale(NamedTuple):
 
     def differs(self, other: 'GrayScale') -> bool:
         """Whether other corners follow from another gray scale."""
+        if other is self:
+            return False
         counts, others = self.counts[self.shown], other.counts[self.shown]
         of_unit = np.stack([others, np.ones_like(others)], axis=1)
         change = counts - of_unit @ np.linalg.lstsq(of_unit, counts, rcond=None)[0]
