@@ -94,14 +94,11 @@ class PoseEkf:
             self._refused_in_row += 1
             return False
         self._refused_in_row = 0
-        if self._input.jump_ns:
-            self._camera_clock.imu_jumped(self._input.jump_ns)
-            self._history.suspect_jump(self._input.excess_ns)
+        if self._input.excess_ns:
+            self._suspect_steps()
         imu, buffer = np.concatenate((sample.angular_velocity, sample.linear_acceleration)), self._history.imu
         seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS
         densities = self._noise.densities(imu, seconds) if len(buffer) else np.zeros(6)
-        if self._config.estimate_time_offset and 0 < self._input.excess_ns < SMALLEST_STEP_NS:
-            self._history.suspect_imu_step(self._input.excess_ns)
         buffer.append(sample.stamp_ns, imu, densities)
         return True
 
@@ -143,6 +140,17 @@ class PoseEkf:
 
     # --- steps of the clocks --------------------------------------------------------------------------
 
+    def _suspect_steps(self) -> None:
+        """Allow for steps of the clocks after the newest sample kept, as far as the stamps of the IMU suggest them."""
+        if self._input.jump_ns:
+            self._camera_clock.imu_jumped(self._input.jump_ns)
+        excess_ns = self._input.excess_ns
+        self._history.suspect_clock_steps(excess_ns)
+        if self._input.jump_ns and excess_ns >= SMALLEST_STEP_NS:
+            self._history.suspect_jump(excess_ns)
+        elif self._config.estimate_time_offset and excess_ns < SMALLEST_STEP_NS:
+            self._history.suspect_imu_step(excess_ns)
+
     def _in_present_clock(self, pose: CameraPose) -> tuple[CameraPose, int]:
         """``pose`` with all steps of the camera's clock taken out of its stamp, a step that it reveals included.
 
@@ -151,7 +159,7 @@ class PoseEkf:
         history, clock, pose = self._history, self._camera_clock, self._camera_clock.stamped(pose)
         if not history.imu:
             return pose, 0
-        interval_ns = self._input.longest_ns
+        interval_ns = self._input.longest_short_ns
         step_ns = clock.proposed(pose, history.imu.newest_ns, interval_ns)
         if not clock.suspects_imu:
             history.explain_jump()

@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import replace
 import math
 from operator import attrgetter
+from typing import NamedTuple
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseLog, PoseUpdate
@@ -36,6 +37,13 @@ _STEP_OR_LOSS = 0.5
 #: recorded gaps samples were lost.
 _STEPS = 0.1
 _stamp = attrgetter('stamp_ns')
+
+
+class OtherEstimate(NamedTuple):
+    """Another estimate of the same instant, and the odds, 0 to 1, that it is the right one."""
+
+    estimate: Estimate
+    odds: float
 
 
 class History:
@@ -73,21 +81,17 @@ class History:
         """The latest belief."""
         return self._beliefs[-1]
 
-    def contradicting(self) -> tuple[Estimate, float] | None:
+    def contradicting(self) -> OtherEstimate | None:
         """The alternative estimate at the newest sample, if the latest poses contradict the main one and support it.
 
         Also one without the time of a jump of the IMU's stamps, until the delay of poses shows whether it has passed.
-
-        Returns
-        -------
-        The estimate, and the share of the square of the difference that counts.
         """
         if self._stepped:
-            return self._stepped.estimate, _STEPS
+            return OtherEstimate(self._stepped.estimate, _STEPS)
         other = self.belief.alternative
         if other is None or other.hits < self.config.initial_poses or not (self.main and self.main.in_doubt):
             return None
-        return self._carried(other, self.imu.newest_ns).estimate, 1.0
+        return OtherEstimate(self._carried(other, self.imu.newest_ns).estimate, 1.0)
 
     def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None, first_offset: float = 0.0) -> int:
         """Instant of a pose in the IMU's clock, by the clock offset of ``hypothesis``; without one ``first_offset``."""
@@ -145,10 +149,9 @@ class History:
     def suspect_imu_step(self, size_ns: int) -> None:
         """Allow for a step of the IMU's clock by ``size_ns`` after the newest sample: or samples are lost there."""
         self._imu_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
-        self._suspect_clock_steps(size_ns)
 
-    def _suspect_clock_steps(self, size_ns: int) -> None:
-        """Allow for a step of all clocks by ``size_ns``: the next pose shows it, and nothing until then."""
+    def suspect_clock_steps(self, size_ns: int) -> None:
+        """Allow for a step of all clocks by ``size_ns`` after the newest sample: the next pose shows it."""
         self._clock_steps.append((self.imu.newest_ns, math.sqrt(_STEPS) * size_ns / SECOND_NS))
 
     def suspect_jump(self, size_ns: int) -> None:
@@ -159,7 +162,6 @@ class History:
         if self.main:
             before = self._carried(self.main, self.imu.newest_ns).estimate
             self._stepped = self.main._replace(estimate=replace(before, stamp_ns=before.stamp_ns + size_ns))
-        self._suspect_clock_steps(size_ns)
 
     def explain_jump(self) -> None:
         """The clock of the IMU has not stepped: samples are lost."""

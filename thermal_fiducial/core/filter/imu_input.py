@@ -13,10 +13,12 @@ from thermal_fiducial.core.types import SECOND_NS
 CLOCK_EVIDENCE, GAP_EVIDENCE = 10, 3
 #: A longer step between stamps is a gap [ns]: the motion in it is not known from the samples at its ends.
 GAP_NS = 30_000_000
-#: A gap is unusual beyond this multiple of the longest recent step; time constant [ns] with which that one decays.
-UNUSUAL_FACTOR, MEMORY_NS = 3.0, 2_000_000_000
-#: A step longer than this multiple of the longest recent one is due to lost samples, or to a step of the clock.
-LOST_FACTOR = 1.5
+#: A gap is unusual beyond this multiple of the longest recent step: at 50 Hz beyond 50 ms, which leaves steps of the
+#: clock by 30 ms to the estimated offset. Time constant [ns] with which the longest step decays.
+UNUSUAL_FACTOR, MEMORY_NS = 2.5, 2_000_000_000
+#: A step longer than this multiple of the longest recent one is due to lost samples, or to a step of the clock: at 50
+#: Hz one by 10 ms. Recorded IMUs seldom exceed it.
+LOST_FACTOR = 1.4
 #: A sensor saturates at its full scale; a reading beyond this multiple of it is a corrupt message.
 IMPOSSIBLE_RANGES = 2.0
 #: An axis is frozen once it has repeated a value for this long [s], in at least this many samples, and in this multiple
@@ -94,9 +96,9 @@ class ImuInput:
         #: since the last sample that was used; None: no sample
         self._strays: StrayRun | None = None
         #: longest recent step [ns]
-        self.longest_ns = 0.0
+        self._longest_ns = 0.0
         #: the longest of those that may hide a small step of the clock: a long gap says nothing of these
-        self._longest_short_ns = 0.0
+        self.longest_short_ns = 0.0
         #: longest step [ns] that is accepted at once, without waiting for a sample that follows
         self._usual_ns: float = min(GAP_NS, self._max_gap_ns)
         #: by how much the step to the last sample that was used exceeds the longest recent short one, if by far [ns]
@@ -139,14 +141,14 @@ class ImuInput:
         assert self._last_ns is not None
         step_ns = stamp_ns - self._last_ns
         gap_ns = jump_ns or step_ns
-        unusual = gap_ns > LOST_FACTOR * self._longest_short_ns > 0.0
-        self.excess_ns = round(gap_ns - self._longest_short_ns) if unusual else 0
+        unusual = gap_ns > LOST_FACTOR * self.longest_short_ns > 0.0
+        self.excess_ns = round(gap_ns - self.longest_short_ns) if unusual else 0
         if 0 < step_ns <= self._max_gap_ns:
             decayed = 1.0 - step_ns / MEMORY_NS
-            self.longest_ns = max(decayed * self.longest_ns, step_ns)
+            self._longest_ns = max(decayed * self._longest_ns, step_ns)
             short_ns = step_ns if self.excess_ns < SMALLEST_STEP_NS else 0
-            self._longest_short_ns = max(decayed * self._longest_short_ns, short_ns)
-            self._usual_ns = min(max(UNUSUAL_FACTOR * self.longest_ns, GAP_NS), self._max_gap_ns)
+            self.longest_short_ns = max(decayed * self.longest_short_ns, short_ns)
+            self._usual_ns = min(max(UNUSUAL_FACTOR * self._longest_ns, GAP_NS), self._max_gap_ns)
         self._last_ns, self._strays, self.jump_ns = stamp_ns, None, jump_ns
 
     def _stray(self, stamp_ns: int) -> Verdict:

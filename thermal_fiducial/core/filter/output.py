@@ -7,7 +7,7 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis
-from thermal_fiducial.core.filter.history import History
+from thermal_fiducial.core.filter.history import History, OtherEstimate
 from thermal_fiducial.core.filter.imu_buffer import LastSample
 from thermal_fiducial.core.filter.state import CORE, Estimate, NavigationState, POSITION, PUBLISHED, ROTATION, VELOCITY
 from thermal_fiducial.core.filter.update import pose_error
@@ -31,22 +31,21 @@ TRACKING, WAITING = Condition('tracking'), Condition('waiting for markers')
 COASTING_S = 0.5
 
 
-def odometry(estimate: Estimate, contradicting: tuple[Estimate, float] | None, sample: LastSample) -> Odometry:
+def odometry(estimate: Estimate, contradicting: OtherEstimate | None, sample: LastSample) -> Odometry:
     """Odometry at an IMU sample.
 
     Parameters
     ----------
-    contradicting : another estimate of the same instant, which widens the covariance by its own, and by a share of the
-        square of their difference
+    contradicting : widens the covariance by its own, and by the square of the difference times its odds
     """
     state = estimate.state
     R, velocity_body = state.R_map_body, state.velocity_body
     joint = estimate.covariance[PUBLISHED, PUBLISHED]
     if contradicting:
-        other, share = contradicting
+        other = contradicting.estimate
         apart = _difference(state, other.state)
         joint = joint.copy()
-        joint[CORE, CORE] += other.covariance[CORE, CORE] + share * np.outer(apart, apart)
+        joint[CORE, CORE] += other.covariance[CORE, CORE] + contradicting.odds * np.outer(apart, apart)
     # Position and rotation errors turn from the robot frame into the map; that of v_body depends on nu and phi.
     J = _AT_REST.copy()
     J[0:3, POSITION] = J[3:6, ROTATION] = R

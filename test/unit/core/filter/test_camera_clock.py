@@ -301,6 +301,18 @@ def test_all_clocks_may_step_by_a_few_samples(step):
     assert sum(state.stamp_ns - START_NS >= AT * 1e9 for state in output) >= (5.0 - AT) * 200.0 - 2
 
 
+@pytest.mark.parametrize('flown', [flown_by_a_stepping_imu, flown_by_stepping_clocks])
+@pytest.mark.parametrize('step', [0.01, 0.04])
+def test_a_slow_imu_hides_no_steps_of_the_clocks(step, flown):
+    """Of half an interval, and of two: delays of poses scatter by an interval, and lost samples leave gaps as long."""
+    stds = {'rotation_std': (0.003, 0.003, 0.001), 'translation_std': (0.0003, 0.0003, 0.003)}
+    flight = Flight(seed=1, seconds=5.0, imu_rate=50.0, **stds)
+    ekf, output, *_ = flown(step, flight)
+    # three sigma, of six degrees of freedom; up to 390 before
+    assert squares_behind_step(flight, output).max() < chi2.ppf(0.9973, 6)
+    assert ekf.resets == 0
+
+
 def test_one_stamp_of_the_imu_half_a_second_ahead_costs_one_sample():
     flight = Flight(seed=3, seconds=3.0)
     arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
