@@ -143,6 +143,12 @@ def test_two_replays_give_the_same_bytes(short, folder):
     assert_same_files(short[1], folder / 'again')
 
 
+def test_a_replay_says_that_it_replaces_an_earlier_one(short, folder, tmp_path, capfd):
+    for said in (0, 1):
+        assert replay(folder / 'short', tmp_path / 'run', folder) == 0
+        assert capfd.readouterr().out.count(f'{tmp_path / "run"}: replacing the earlier run there') == said
+
+
 def test_a_folder_into_which_another_replay_writes_is_left_alone(folder, tmp_path, capfd):
     out = tmp_path / 'run'
     out.mkdir()

@@ -30,7 +30,7 @@ def chosen(args: argparse.Namespace) -> tuple[Gray, list[int]]:
 
 
 def _id_list(text: str, count: int, dictionary: str) -> list[int]:
-    """IDs of ``text``, all of them among the ``count`` of the dictionary."""
+    """IDs of ``text``, each once, all of them among the ``count`` of the dictionary."""
     ids: list[int] = []
     for part in text.split(','):
         start, dash, end = part.partition('-')
@@ -44,4 +44,4 @@ def _id_list(text: str, count: int, dictionary: str) -> list[int]:
         ids += range(first, last + 1)
     if not ids:
         raise InputError(f'--ids {text!r} names no marker')
-    return ids
+    return list(dict.fromkeys(ids))

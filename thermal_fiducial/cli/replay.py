@@ -68,7 +68,7 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay the bag, write the run folder, print a summary."""
-    refuse_other_folder(args.out)
+    replaces = refuse_other_folder(args.out)
     _check_packages(report=not args.no_report, video=args.video)
     if args.video:
         _require_images(args.bag, parse_remaps(args.remap))
@@ -86,6 +86,8 @@ def run(args: argparse.Namespace) -> int:
         second_camera=args.second_camera.strip('/'),
         remaps=parse_remaps(args.remap),
     )
+    if replaces:
+        print(f'{args.out}: replacing the earlier run there')
     started = time.monotonic()
     with progress_bar(f'replay {args.bag.name}') as progress:
         summary = replay.replay(options, progress, _warn, _say)

@@ -422,6 +422,12 @@ def test_nothing_is_written_where_one_file_exists(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ['marker-3.dxf']
 
 
+def test_a_marker_that_is_named_twice_is_drawn_once(tmp_path, capsys):
+    arguments = ['--ids', '2-3,3,2', '--size', '120', '--formats', 'svg', '--out', str(tmp_path)]
+    assert main(['markers', 'make', *arguments]) == 0
+    assert capsys.readouterr().out.count('marker-2:') == 1
+
+
 def test_commands_write_the_files_that_they_print(tmp_path, capsys):
     assert main(['markers', 'make', '--ids', '2-3', '--size', '120', '--out', str(tmp_path)]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
