@@ -69,11 +69,8 @@ def locate(
     frame = kind(stamp_ns, sight, camera, model, fit)
     # Steps 3 and 4: the pose from all markers jointly, weighted by the map.
     by_map = frame.map_weights(hypotheses[0])
-    T = hypotheses[0]
+    T = fit.solve(hypotheses[:1], by_map)[0][0]
     reprojection = sight.reprojected(camera, T)
-    if reprojection.shown.all():
-        T = fit.solve(hypotheses[:1], by_map)[0][0]
-        reprojection = sight.reprojected(camera, T)
     if not (shown := reprojection.shown).all():
         # A marker that the camera could not show is not where the map has it. The others give the pose, if most are.
         if 2 * np.count_nonzero(shown) > len(shown):
@@ -303,9 +300,11 @@ class _SurveyedFit(_JointFit):
         weighted = information @ residuals
         pulls, of_each = weighted.reshape(-1, 4, 2, 1), diagonal_blocks(information)
         squared = (pulls * (inverse_2x2(of_each) @ pulls)).sum(axis=(-2, -1))
-        excess = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
-        robust = weights[:, None, None] * np.linalg.inv(of_survey + block_diagonal(of_corners * excess))
-        return np.asarray((robust @ reprojection.J_camera).reshape(-1, 6)), float((residuals * weighted).sum())
+        chi2, outlying = float((residuals * weighted).sum()), squared > INLIER**2
+        if outlying.any():
+            excess = np.where(outlying, squared / INLIER**2, 1.0)[..., None, None]
+            information = weights[:, None, None] * np.linalg.inv(of_survey + block_diagonal(of_corners * excess))
+        return np.asarray((information @ reprojection.J_camera).reshape(-1, 6)), chi2
 
     def _of_survey(self, reprojection: Reprojected) -> FloatArray:
         """Covariances (N, 8, 8) [px^2] of the corners by errors of the survey: zero of the other markers."""
