@@ -78,18 +78,6 @@ _LEAST_STD = 1e-6
 # Poses from the corners of a frame.
 
 
-def noise_of_pose(gains: FloatArray, covariances: FloatArray, chi2: float) -> FloatArray:
-    """Covariance (6, 6) of a pose by the noise of n corners, scaled up to the residuals if these are larger.
-
-    Parameters
-    ----------
-    gains : (n, 6, 2) derivative of the pose by each corner [1/px]
-    covariances : (n, 2, 2) [px^2]
-    chi2 : of the residuals
-    """
-    return noise_factor(chi2, 2 * len(gains) - 6) * independent_sum(gains, covariances)
-
-
 def noise_factor(chi2: float, freedom: int) -> float:
     """Ratio of the variance of residuals to the claimed one, at least 1, by which covariances are scaled.
 

@@ -7,7 +7,7 @@ two hypotheses). A marker alone in view has nothing but odometry to contradict. 
 frames of a second are evidence, and put the marker in quarantine.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -167,7 +167,7 @@ class Consistency:
         known: ObjectArray,
         errors_px: FloatArray,
         error_std_px: FloatArray,
-        left_out: BoolArray,
+        used: Collection[int],
     ) -> bool:
         """Put persistently inconsistent markers in quarantine after a frame, and release consistent ones.
 
@@ -176,7 +176,7 @@ class Consistency:
         markers : of the map; those that enter or leave quarantine are replaced
         known : the N of them in the frame
         errors_px, error_std_px : (N,) their rms re-projection errors, and the standard deviations of these
-        left_out : (N,) which of them the pose left out, as odometry contradicts them: inconsistent
+        used : IDs of those that the pose is from; trusted ones that it left out contradict odometry
 
         Returns
         -------
@@ -185,6 +185,7 @@ class Consistency:
         if len(known) < 2:
             return False
         ratios = errors_px / error_std_px
+        left_out = np.array([marker.trusted and marker.id not in used for marker in known])
         blamed = self._blamed(ratios > DISAGREEMENT, left_out, known.tolist())
         changed = False
         columns = blamed.tolist(), errors_px.tolist(), ratios.tolist()

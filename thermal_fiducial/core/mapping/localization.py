@@ -16,9 +16,9 @@ from thermal_fiducial.core.error_model import (
     decision_weights,
     diagonal_blocks,
     drawn_sum,
+    independent_sum,
     map_weights,
     noise_factor,
-    noise_of_pose,
     survey_for_weights,
     SystematicErrors,
 )
@@ -71,7 +71,8 @@ def locate(
     by_map = frame.map_weights(hypotheses[0])
     T = fit.solve(hypotheses[:1], by_map)[0][0]
     reprojection = sight.reprojected(camera, T)
-    if not (shown := reprojection.shown).all():
+    shown = np.isfinite(reprojection.errors_px)
+    if not shown.all():
         # A marker that the camera could not show is not where the map has it. The others give the pose, if most are.
         if 2 * np.count_nonzero(shown) > len(shown):
             return locate(stamp_ns, sight.only(shown), camera, prior, model)
@@ -214,7 +215,8 @@ class _JointFit:
         """
         n, sight, model = len(weights), self.sight, self.model
         by_corner = np.swapaxes(gains.reshape(6, 4 * n, 2), 0, 1)
-        white = noise_of_pose(by_corner, sight.observed.covariances.reshape(-1, 2, 2), chi2)
+        white = independent_sum(by_corner, sight.observed.covariances.reshape(-1, 2, 2))
+        white *= noise_factor(chi2, 8 * n - 6)
         lens = LensErrors(sight.observed.corners, self.camera, model)
         arms = sight.points - sight.T_map_marker[:, None, :3, 3]
         grown = gains @ (reprojection.J_marker.reshape(n, 4, 2, 6)[..., :3] @ arms[..., None]).ravel()
@@ -243,7 +245,9 @@ class _JointFit:
         """
         T = found.pose.T_map_camera
         apart = rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE
-        if self._extent(found.weights) > WIDE or not np.any(apart):
+        heavy = found.weights >= _HEAVY * found.weights.max()
+        extent = np.ptp(self.sight.observed.corners[heavy], axis=(0, 1)) / self.camera.focal_px
+        if math.hypot(*extent) > WIDE or not np.any(apart):
             return None
         starts, weights = hypotheses[apart], found.weights * decision_weights(self.sight.noise_px, self.model)
         (T, other), chi2, _ = self.fit.solve(np.stack([T, starts[0]]), weights, inlier=np.inf)
@@ -255,12 +259,6 @@ class _JointFit:
         excesses = np.maximum(self.fit.costs(starts, weights, inlier=np.inf) - chi2[0], 0.0) / scale
         far = int(np.argmax(turns**2 * np.exp(-0.5 * excesses)))
         return None if excesses[far] > DECISIVE else _Alternative(starts[far], float(excesses[far]), is_minimum=False)
-
-    def _extent(self, weights: FloatArray) -> float:
-        """Angle [rad] between the corners that are farthest apart, of the markers that have most of the weight."""
-        heavy = weights >= _HEAVY * weights.max()
-        width, height = np.ptp(self.sight.observed.corners[heavy], axis=(0, 1)) / self.camera.focal_px
-        return math.hypot(width, height)
 
     def map_weights(self, T_map_camera: FloatArray) -> FloatArray:
         """Weights (N,) of the markers by their covariances in the map."""

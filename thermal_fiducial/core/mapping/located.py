@@ -92,11 +92,6 @@ class Reprojected:
     J_marker: FloatArray
 
     @cached_property
-    def shown(self) -> BoolArray:
-        """Which markers (N,) the camera can show."""
-        return np.asarray(np.isfinite(self.residuals).all(axis=(1, 2)))
-
-    @cached_property
     def errors_px(self) -> FloatArray:
         """Rms error (N,) [px] of each marker; NaN behind the camera."""
         return np.asarray(np.sqrt((self.residuals**2).sum(axis=(1, 2)) / 4.0))
@@ -224,10 +219,6 @@ class LocatedFrame:
         )
         errors = np.fmin(reprojection.errors_px, float(self.camera.width))
         return errors, error_std_px(known, reprojection, pose.covariance)
-
-    def left_out(self, location: Location) -> BoolArray:
-        """Which of the K known markers (K,) the pose left out, though they were trusted."""
-        return self.known.trusted & ~np.isin(self.known.observed.ids, location.sight.observed.ids)
 
 
 def squared_distance(pose: CameraPose, predicted: CameraPose) -> float:

@@ -183,7 +183,8 @@ class MarkerMapper:
             self._bias.add(outcome)
             known, (errors, error_stds) = frame.known.markers, frame.known_errors(outcome)
             if self._owns_map:
-                changed = self._consistency.judge(self.map.markers, known, errors, error_stds, frame.left_out(outcome))
+                used = outcome.pose.marker_ids
+                changed = self._consistency.judge(self.map.markers, known, errors, error_stds, used)
             # Step 8: new markers placed relative to the camera.
             if not self.frozen:
                 for marker, error in zip(known, errors.tolist(), strict=True):
