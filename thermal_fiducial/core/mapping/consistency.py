@@ -49,36 +49,36 @@ _BEFORE_NS = SECOND_NS // 3
 _FORGOTTEN_NS = 60 * SECOND_NS
 
 
-def are_two_that_contradict(location: Location) -> bool:
-    """Whether the pose comes from two markers of which it does not fit at least one."""
-    sight, reprojection = location.sight, location.reprojection
-    if len(sight.markers) != 2:
-        return False
-    return bool(np.any(reprojection.errors_px > DISAGREEMENT * error_std_px(sight, reprojection, np.zeros((6, 6)))))
-
-
-def settled(
-    found: Location, camera: Camera, predicted: CameraPose, fit: Callable[[Sight], Location | Refusal]
+def from_consistent_markers(
+    sight: Sight, camera: Camera, predicted: PredictedCamera | None, fit: Callable[[Sight], Location | Refusal]
 ) -> Location | Refusal:
-    """The camera from the one of two contradicting markers that is where odometry predicts it.
+    """The camera from all markers; from two that contradict each other, by the one where odometry predicts it.
 
     Where odometry does not decide, the pose is that of the marker nearer to the prediction, and may as well be that of
     the other: an error of the map.
 
     Parameters
     ----------
-    found : the pose from both
-    predicted : the camera by odometry, with its covariance
+    sight : at least one trusted marker
+    predicted : the camera by odometry
     fit : the pose from some of the markers
     """
-    sight = found.sight
-    apart = _distances(sight, camera, predicted)
+    found = fit(sight)
+    if isinstance(found, Refusal) or len(found.sight.markers) != 2:
+        return found
+    sight, reprojection = found.sight, found.reprojection
+    if not np.any(reprojection.errors_px > DISAGREEMENT * error_std_px(sight, reprojection, np.zeros((6, 6)))):
+        return found
+    contradiction = Refusal(f'{names(sight)} contradict each other')
+    if predicted is None:
+        return contradiction
+    apart = _distances(sight, camera, predicted.pose)
     nearer = np.arange(2) == apart.argmin()
     if np.ptp(apart) > DECISIVE:
         return fit(sight.only(nearer))
     one, other = fit(sight.only(nearer)), fit(sight.only(~nearer))
     if isinstance(one, Refusal) or isinstance(other, Refusal):
-        return contradicting(sight)
+        return contradiction
     spread = covariance_of_one_error(difference(other.pose.T_map_camera, one.pose.T_map_camera))
     pose = replace(
         found.pose,
@@ -87,11 +87,6 @@ def settled(
         map_covariance=one.pose.map_covariance + spread,
     )
     return replace(found, pose=pose, noise=found.noise + spread, settled=False)
-
-
-def contradicting(sight: Sight) -> Refusal:
-    """No pose from markers that contradict each other."""
-    return Refusal(f'{names(sight)} contradict each other')
 
 
 class Consistency:

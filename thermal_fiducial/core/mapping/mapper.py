@@ -20,7 +20,7 @@ from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers
-from thermal_fiducial.core.mapping.consistency import are_two_that_contradict, Consistency, contradicting, settled
+from thermal_fiducial.core.mapping.consistency import Consistency, from_consistent_markers
 from thermal_fiducial.core.mapping.corner_bias import CornerBias
 from thermal_fiducial.core.mapping.keyframes import KeyframeStore, VIEWS
 from thermal_fiducial.core.mapping.localization import locate
@@ -28,7 +28,7 @@ from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusa
 from thermal_fiducial.core.mapping.map_data import jump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
-from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera
+from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Reason for which the map is not updated from a frame with a pose.
@@ -120,30 +120,20 @@ class MarkerMapper:
         is_known = np.array([key in self.map.markers for key in observed.ids.tolist()], dtype=np.bool_)
         own = observed if is_known.all() else observed.only(is_known)
         known = Sight.of(own, self.map)
-        offset_std = self.config.time_offset_std
-        predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, offset_std)
+        predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
         sight = known if known.trusted.all() else known.only(known.trusted)
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.markers):
-            outcome = self._located(stamp_ns, sight, camera, predicted)
+            expected = predicted.pose if predicted is not None else self._last_at(stamp_ns)
+            fit = partial(locate, stamp_ns, camera=camera, prior=expected, model=self._errors)
+            outcome = from_consistent_markers(sight, camera, predicted, fit)
         elif len(known.markers):
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
         frame = LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome)
         return self._consistency.checked(frame)
-
-    def _located(
-        self, stamp_ns: int, sight: Sight, camera: Camera, predicted: PredictedCamera | None
-    ) -> Location | Refusal:
-        """The camera from the trusted markers in view, at least one."""
-        expected = predicted.pose if predicted is not None else self._last_at(stamp_ns)
-        fit = partial(locate, stamp_ns, camera=camera, prior=expected, model=self._errors)
-        found = fit(sight)
-        if isinstance(found, Refusal) or not are_two_that_contradict(found):
-            return found
-        return contradicting(sight) if predicted is None else settled(found, camera, predicted.pose, fit)
 
     def _last_at(self, stamp_ns: int) -> CameraPose | None:
         """The last pose for a frame that follows soon, uncertain by what a robot may have turned since."""
