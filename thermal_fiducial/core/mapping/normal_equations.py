@@ -1,6 +1,8 @@
 """Normal equations of a bundle adjustment over keyframes and nodes: Schur complement, solution, covariances."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -8,10 +10,10 @@ import numpy as np
 from thermal_fiducial.core.geometry.rigid_fit import SINGULAR
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
-# Columns of a sparse matrix's inverse that are computed at a time.
-_CHUNK = 96
 # Unknowns up to which a dense factorisation is faster than a sparse one.
 _DENSE = 1500
+# Entries of the inverse that are computed at a time: all of a dense one.
+_ENTRIES = _DENSE**2
 # Share of the markers that a keyframe sees from which a dense product is faster than a sparse one.
 _FULL = 0.15
 
@@ -48,10 +50,10 @@ class NormalEquations:
             root = np.linalg.inv(np.linalg.cholesky(_damped(blocks.frame, damping)))
             coupling, matrix = self._schur(root[self._frame] @ blocks.cross[self._order], _damped(blocks.node, damping))
             free = np.flatnonzero(np.repeat(~self._held, 6))
-            factor = _factorised(matrix[free][:, free])
+            solve_free = _solver(matrix[free][:, free])
         except (RuntimeError, ValueError, np.linalg.LinAlgError):
             return None
-        return ReducedSystem(root, coupling, matrix, factor, self._held)
+        return ReducedSystem(root, coupling, matrix, solve_free, self._held)
 
     def _schur(self, cross: FloatArray, own: FloatArray) -> tuple[Any, Any]:
         """Coupling (6 F, 6 M) of keyframes and nodes, and Schur complement (6 M, 6 M); sparse in large maps.
@@ -83,9 +85,9 @@ class ReducedSystem:
     root: FloatArray
     #: (6 F, 6 M) these factors times the cross blocks of keyframes and nodes
     coupling: Any
-    #: (6 M, 6 M) Schur complement, and the factorisation of its part of free nodes
+    #: (6 M, 6 M) Schur complement, and what solves its part of the m free nodes for right sides (6 m, K)
     matrix: Any
-    factor: '_Dense | _Sparse'
+    solve_free: Callable[[FloatArray], FloatArray]
     #: (M,)
     held: BoolArray
 
@@ -95,14 +97,21 @@ class ReducedSystem:
         sides = (self.root @ of_frames).reshape(-1, count)
         remaining = (of_nodes.reshape(-1, count) - self.coupling.T @ sides).reshape(of_nodes.shape)
         nodes = np.zeros_like(of_nodes)
-        nodes[~self.held] = self.factor.solve(remaining[~self.held].reshape(-1, count)).reshape(-1, 6, count)
+        nodes[~self.held] = self.solve_free(remaining[~self.held].reshape(-1, count)).reshape(-1, 6, count)
         left = sides - self.coupling @ nodes.reshape(-1, count)
         return np.swapaxes(self.root, -1, -2) @ left.reshape(of_frames.shape), nodes
 
     def covariances(self) -> FloatArray:
         """Covariances (M, 6, 6) of the nodes by noise."""
-        result = np.zeros((len(self.held), 6, 6))
-        result[~self.held] = self.factor.covariances()
+        free, result = np.flatnonzero(~self.held), np.zeros((len(self.held), 6, 6))
+        number = max(_ENTRIES // (36 * len(free)), 1)
+        for first in range(0, len(free), number):
+            some = free[first : first + number]
+            unit = np.zeros((len(free), 6, len(some), 6))
+            each = np.arange(len(some))
+            unit[first + each, :, each] = np.eye(6)
+            inverse = self.solve_free(unit.reshape(6 * len(free), -1)).reshape(unit.shape)
+            result[some] = inverse[first + each, :, each]
         return 0.5 * (result + np.swapaxes(result, -1, -2))
 
     def by_held(self, drawn: FloatArray) -> FloatArray:
@@ -110,7 +119,7 @@ class ReducedSystem:
         free, result = ~self.held, np.where(self.held[:, None, None], drawn, 0.0)
         if result.any():
             moved = (self.matrix @ result.reshape(-1, result.shape[-1])).reshape(result.shape)
-            result[free] = -self.factor.solve(moved[free].reshape(-1, result.shape[-1])).reshape(result[free].shape)
+            result[free] = -self.solve_free(moved[free].reshape(-1, result.shape[-1])).reshape(result[free].shape)
         return np.asarray(result)
 
 
@@ -121,57 +130,16 @@ def _damped(H: FloatArray, damping: float) -> FloatArray:
     return np.asarray(H + (damping * diagonal + floor)[..., None] * np.eye(6))
 
 
-def _diagonal_blocks(matrix: FloatArray) -> FloatArray:
-    """The 6 x 6 blocks (m, 6, 6) on the diagonal of a matrix (6 m, 6 m)."""
-    each = np.arange(len(matrix) // 6)
-    return np.asarray(matrix.reshape(len(each), 6, len(each), 6)[each, :, each])
-
-
-@dataclass(frozen=True)
-class _Dense:
-    """A small positive definite matrix (6 m, 6 m)."""
-
-    matrix: FloatArray
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solutions of right sides (6 m, K)."""
-        return np.asarray(np.linalg.solve(self.matrix, right))
-
-    def covariances(self) -> FloatArray:
-        """The 6 x 6 blocks (m, 6, 6) on the diagonal of the inverse."""
-        return _diagonal_blocks(np.asarray(np.linalg.inv(self.matrix), dtype=np.float64))
-
-
-@dataclass(frozen=True)
-class _Sparse:
-    """Factors of a large matrix (6 m, 6 m)."""
-
-    lu: Any
-    unknowns: int
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solutions of right sides (6 m, K)."""
-        return np.asarray(self.lu.solve(right))
-
-    def covariances(self) -> FloatArray:
-        """The 6 x 6 blocks (m, 6, 6) on the diagonal of the inverse."""
-        blocks = []
-        for low in range(0, self.unknowns, _CHUNK):
-            width = min(_CHUNK, self.unknowns - low)
-            unit = np.zeros((self.unknowns, width))
-            unit[low + np.arange(width), np.arange(width)] = 1.0
-            blocks.append(_diagonal_blocks(self.lu.solve(unit)[low : low + width]))
-        return np.concatenate(blocks)
-
-
-def _factorised(S: Any) -> _Dense | _Sparse:
+def _solver(S: Any) -> Callable[[FloatArray], FloatArray]:
     """What solves with a positive definite matrix; LinAlgError if a small one is not, RuntimeError if singular."""
     if isinstance(S, np.ndarray):
         np.linalg.cholesky(S)
-        return _Dense(S)
+        return partial(np.linalg.solve, S)
     from scipy.sparse import csc_array
     from scipy.sparse.linalg import splu
 
     options = {'SymmetricMode': True}
-    lu = splu(csc_array(S), permc_spec='MMD_AT_PLUS_A', options=options, diag_pivot_thresh=0.0)
-    return _Sparse(lu, S.shape[0])
+    solve: Callable[[FloatArray], FloatArray] = splu(
+        csc_array(S), permc_spec='MMD_AT_PLUS_A', options=options, diag_pivot_thresh=0.0
+    ).solve
+    return solve

@@ -46,6 +46,8 @@ def way(request, monkeypatch):
         monkeypatch.setattr(normal_equations, '_FULL', 2.0)
     if request.param == 'sparse':
         monkeypatch.setattr(normal_equations, '_DENSE', 0)
+        # One marker's columns of the inverse at a time.
+        monkeypatch.setattr(normal_equations, '_ENTRIES', 0)
 
 
 @pytest.mark.usefixtures('way')
