@@ -166,7 +166,11 @@ class Camera:
         return uv.reshape(x.shape), by_x.reshape(*x.shape, 2)
 
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
-        """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
+        """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`."""
+        return self.normalise_linearised(uv)[0]
+
+    def normalise_linearised(self, uv: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """:meth:`normalise`, and the derivative (..., 2, 2) of :meth:`distort` there, to a millionth.
 
         Newton's method converges at the border of a lens, where OpenCV's iterations do not: that of ``fisheye`` ends at
         a distorted radius of a right angle, which lenses reach at smaller angles. Pixels that show what is no longer in
@@ -181,7 +185,7 @@ class Camera:
             x = x + step
             if np.abs(step).max(initial=0.0) < _SHORT:
                 break
-        return np.asarray(x)
+        return np.asarray(x), J
 
     def rays(self, uv: npt.ArrayLike) -> FloatArray:
         """Unit viewing directions (..., 3) of pixels (..., 2); not finite where the lens shows nothing."""
@@ -272,7 +276,8 @@ class ImagePoints(Stacked):
     @staticmethod
     def at(px: FloatArray, camera: Camera) -> 'ImagePoints':
         """Those at pixels (..., 2)."""
-        return ImagePoints.seen_at(camera.normalise(px), camera)
+        x, J = camera.normalise_linearised(px)
+        return ImagePoints(px, x, J, inverse_2x2(J))
 
     @staticmethod
     def seen_at(x: FloatArray, camera: Camera) -> 'ImagePoints':

@@ -148,7 +148,7 @@ class CameraFit:
         middle = squares.mean(axis=(0, 1))
         self._T_map_middle = se3.transform(np.eye(3), middle)
         self._points = (squares - middle).reshape(1, -1, 3)
-        points = ImagePoints.seen_at(camera.normalise(corners.reshape(1, -1, 2)), camera)
+        points = ImagePoints.at(corners.reshape(1, -1, 2), camera)
         self._images = Images.of(points, whitening(covs).reshape(1, -1, 2, 2))
 
     def solve(
