@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Self, TypeAlias, TypeVar
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,8 +14,6 @@ ObjectArray: TypeAlias = npt.NDArray[np.object_]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Counts: TypeAlias = npt.NDArray[np.uint16]
 Gray: TypeAlias = npt.NDArray[np.uint8]
-
-Numbers = TypeVar('Numbers', bound=npt.NDArray[Any])
 
 #: Nanoseconds of a second: stamps are whole nanoseconds, and seconds only differences of them.
 SECOND_NS = 1_000_000_000
@@ -40,11 +38,13 @@ class Stacked:
         pairs = zip(self._fields(), others._fields(), strict=True)
         return self._of(a.joined(b) if isinstance(a, Stacked) else np.concatenate([a, b]) for a, b in pairs)
 
-    def with_others(self, which: IntArray, others: Self) -> Self:
-        """The batch with its items at ``which``, in their order, replaced by ``others``."""
-        if len(which) == len(self._fields()[0]):
-            return others
-        return self._of(_with(a, which, b) for a, b in zip(self._fields(), others._fields(), strict=True))
+    def put(self, which: IntArray, others: Self) -> None:
+        """Put ``others`` in the place of the items at ``which``, in their order."""
+        for field, there in zip(self._fields(), others._fields(), strict=True):
+            if isinstance(field, Stacked):
+                field.put(which, there)
+            elif isinstance(field, np.ndarray):
+                field[which] = there
 
     def _fields(self) -> list[Any]:
         names: tuple[str, ...] = self.__slots__
@@ -53,19 +53,6 @@ class Stacked:
     def _of(self, fields: Iterable[Any]) -> Self:
         make: Callable[..., Self] = type(self)
         return make(*fields)
-
-
-def _with(field: Any, which: IntArray, others: Any) -> Any:
-    if isinstance(field, Stacked):
-        return field.with_others(which, others)
-    return changed(field, which, others) if isinstance(field, np.ndarray) else field
-
-
-def changed(values: Numbers, which: IntArray, others: Numbers) -> Numbers:
-    """A copy of an array with its entries at ``which`` replaced by ``others``."""
-    copy = values.copy()
-    copy[which] = others
-    return copy
 
 
 def _at(field: Any, keep: BoolArray | IntArray) -> Any:

@@ -31,16 +31,16 @@ _SURFACE_ENDS = 1.0
 #: Parameters of a fit: u of the corners and v of them, blur, and amounts of the linear terms; the first of these is the
 #: contrast.
 CORNERS, BLUR, LINEAR = slice(0, 8), 8, slice(9, None)
-#: Places among the linear terms of those whose amounts are known to be small: the bowl of the warm surface, three
-#: curvatures of the level, and in pictures for a display what bends its gray scale; the values of the first four at the
+#: Places among the linear terms of those whose amounts are known to be small: three curvatures of the level, the bowl
+#: of the warm surface, and in pictures for a display what bends its gray scale; the values of the first four at the
 #: corners.
-SMALL = slice(4, None)
-SMALL_AT_CORNERS = np.array([0.5, 0.25, 0.25, 0.25])
+SMALL = slice(7, None)
+SMALL_AT_CORNERS = np.array([0.25, 0.25, 0.25, 0.5])
 #: Amounts of what bends the gray scale of a display. After a plateau equalisation markers of 27 px in motion are 0.046,
 #: 0.032, 0.027 and 0.027 px off with one to four, those of 40 px 0.17, 0.10, 0.076 and 0.073 px.
 BENDS = 3
 # Places among the linear terms of the gradients of the contrast, of the bowl, and of what bends the gray scale.
-_GRADIENTS, _BOWL, _BENT = slice(1, 3), 4, slice(8, 8 + BENDS)
+_GRADIENTS, _BOWL, _BENT = slice(1, 3), 10, slice(11, 11 + BENDS)
 # Cumulative standard normal distribution, by a table.
 _FARTHEST = 6.0
 _Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
@@ -78,8 +78,8 @@ class PatternGrid(NamedTuple):
     #: (2, P) places from the middle, in sides, and their squared distances (P,) from there
     middle: Float32Array
     bowl: Float32Array
-    #: (3, P) quadratic functions of these places: the curvatures of a level
-    curvatures: Float32Array
+    #: (6, P) functions of these places up to quadratic ones
+    levels: Float32Array
     #: distance of the samples [cells]
     apart: float
     #: n, and samples along the sides of a patch
@@ -127,13 +127,11 @@ def pattern_grid(cells: int, density: int, nearer: int = 0, *, bent: bool = Fals
     linear = [np.ones_like(a), a, b]
     background = np.linalg.qr(np.stack([*linear, a * a, a * b, b * b] if bent else linear, axis=1))[0]
     weights, middle = bilinear(a, b).astype(np.float32), np.stack([a, b]).astype(np.float32) - np.float32(0.5)
-    curvatures = np.stack([middle[0] * middle[0], middle[0] * middle[1], middle[1] * middle[1]])
-    bowl = curvatures[0] + curvatures[2]
+    u, v = middle
+    levels, bowl = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v]), u * u + v * v
     nodes = (_of_nodes(b)[:, None] * _of_nodes(a)).reshape(-1, a.size).astype(np.float32)
     background = background.astype(np.float32)
-    return PatternGrid(
-        along, weights, nodes, background, middle, bowl, curvatures, apart, lines, density, graded=not bent
-    )
+    return PatternGrid(along, weights, nodes, background, middle, bowl, levels, apart, lines, density, graded=not bent)
 
 
 def _of_nodes(share: FloatArray) -> FloatArray:
@@ -272,25 +270,26 @@ def _gaussian(
 
 def linear_terms(
     model: PatternModel, spread: FloatArray, grid: PatternGrid, cells: int, *, displayed: bool
-) -> Float32Array:
-    """Linear terms (Q, L, P): the pattern; where the contrast is graded its gradients, and end and bowl of the surface.
+) -> list[Float32Array]:
+    """Linear terms, (Q, ., P) each: the pattern; where it is graded its gradients, surface's end, levels, and bowl.
 
     The bowl shows through the white cells alone, what curves the level is before all cells. In a picture for a display
     also what a polynomial of the counts adds between black and white.
     """
     if not grid.graded:
-        return model.value[:, None]
+        return [grid.without_background(model.value)[:, None]]
     # Of a blurred product with a linear function: the gradient of what is blurred moves with it.
     displaced = (spread / cells).astype(np.float32) @ model.slopes.swapaxes(0, 1)
     graded = model.value[:, None] * grid.middle + displaced
     bowl = grid.bowl * (1.0 + model.value) + 2.0 * (grid.middle * displaced).sum(axis=1)
-    level = np.broadcast_to(grid.curvatures, (len(spread), *grid.curvatures.shape))
-    terms = [model.value[:, None], graded, model.surface[:, None], bowl[:, None], level]
+    level = np.broadcast_to(grid.levels, (len(spread), *grid.levels.shape))
+    # What lacks of the surface, not the surface: small numbers for sums in single precision.
+    terms = [model.value[:, None], graded, model.surface[:, None] - np.float32(1.0), level, bowl[:, None]]
     if displayed:
         across = 2.0 * model.value + 1.0
         bent = model.value * (1.0 + model.value)
-        terms.append(np.stack([bent, across * bent, across * across * bent], axis=1))
-    return np.concatenate(terms, axis=1)
+        terms += [part[:, None] for part in (bent, across * bent, across * across * bent)]
+    return terms
 
 
 def local_contrast(amounts: Float32Array, model: PatternModel, grid: PatternGrid, *, displayed: bool) -> Float32Array:

@@ -19,7 +19,7 @@ from thermal_fiducial.core.detection.corners.blurred_patterns import (
     pattern_grid,
     PatternView,
 )
-from thermal_fiducial.core.detection.corners.pattern_residuals import fitted, Unevenness
+from thermal_fiducial.core.detection.corners.pattern_residuals import fitted, products_of, Unevenness
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, TINY
 
@@ -66,12 +66,13 @@ class GrayScale(NamedTuple):
         grid, white = pattern_grid(decoder.cells, _DENSITY), decoder.patterns(ids, np.zeros_like(ids))
         to_cells = cells_by_pixels(corners_px, decoder.cells)
         model, spread = blurred(view, to_cells, np.full(len(ids), blur_px), white, grid)
-        terms = grid.without_background(linear_terms(model, spread, grid, decoder.cells, displayed=False))
+        terms = np.concatenate(linear_terms(model, spread, grid, decoder.cells, displayed=False), axis=1)
+        products = products_of(terms)
         gray, pattern, apart_px = view.values(corners_px, grid), grid.patches(model.value), grid.apart_px(to_cells)
         scale = self
         for _ in range(_ROUNDS):
             counts = np.interp(gray, _LEVELS, scale.counts).astype(np.float32)
-            rest = grid.patches(fitted(terms, grid.without_background(counts))[1])
+            rest = grid.patches(fitted(terms, products, counts - counts[:, :1], None)[1])
             left = Unevenness.shown(pattern, rest, apart_px).left(rest)
             scale = _by_means(counts.ravel() - left.ravel(), gray.ravel(), scale)
         return scale

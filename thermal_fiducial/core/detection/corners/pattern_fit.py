@@ -9,7 +9,6 @@ r with a probability of the order of r^(v/2), where v is the number of independe
 most one a bit: -v/2 log r is the log-likelihood ratio of the marker over such a square.
 """
 
-from dataclasses import replace
 import math
 from typing import NamedTuple
 
@@ -77,7 +76,7 @@ _LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.3, (0.5, 2.0)
 _FOCUS, _START = 0.3, 0.5
 # Standard deviations of amounts that are small, as shares of the contrast.
 _SMALL_STD = np.concatenate(
-    [np.array([SURFACE_FALLS, LEVEL_BENDS, LEVEL_BENDS, LEVEL_BENDS]) / SMALL_AT_CORNERS, np.full(BENDS, GRAY_BENDS)]
+    [np.array([LEVEL_BENDS, LEVEL_BENDS, LEVEL_BENDS, SURFACE_FALLS]) / SMALL_AT_CORNERS, np.full(BENDS, GRAY_BENDS)]
 )
 # Parameters of a fit: corners, blur, contrast, warm surface, level, background. A fit to something that is not there
 # makes use of fewer, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 it
@@ -102,15 +101,12 @@ class _Prior(NamedTuple):
     corners_std: FloatArray
     blur_px: float
 
-    def normal_equations(self, at: PatternResiduals, by_samples: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """With it, (Q, K, K), (Q, K, 1), for samples with a variance of 1.
-
-        ``by_samples`` (Q, K, K): information by the samples alone.
-        """
+    def normal_equations(self, at: PatternResiduals) -> tuple[FloatArray, FloatArray]:
+        """With it, (Q, K, K), (Q, K, 1), for samples with a variance of 1."""
         precision, off = self._precision(at), np.zeros(at.J.shape[:2])
         off[:, CORNERS] = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
         off[:, BLUR], off[:, LINEAR][:, SMALL] = at.blur - self.blur_px, at.amounts[:, SMALL]
-        information = by_samples.copy()
+        information = at.information.copy()
         np.einsum('qii->qi', information)[:] += precision
         return _solvable(information), _gradient(at) + (precision * off)[..., None]
 
@@ -205,10 +201,9 @@ def fit_patterns(
     density = max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX))
     grid = pattern_grid(decoder.cells, min(density, _MOST), nearer)
     prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
-    at = linearised(view, quads, blur, white, grid)
-    by_samples = at.information()
+    at = linearised(view, quads.copy(), blur, white, grid)
     for left in reversed(range(_STEPS)):
-        information, product = prior.normal_equations(at, by_samples)
+        information, product = prior.normal_equations(at)
         move = _step(information, product)
         quads, blur = _moved(at, move, blur_px)
         step = np.abs(quads - at.corners_px).max(axis=(1, 2))
@@ -217,12 +212,10 @@ def fit_patterns(
         if left == 0 or not len(anew) + len(again):
             break
         if len(anew):
-            there = linearised(view.only(anew), quads[anew], blur[anew], white[anew], grid)
-            at, by_samples[anew] = at.with_others(anew, there), there.information()
+            at.put(anew, linearised(view.only(anew), quads[anew], blur[anew], white[anew], grid))
         if len(again):
-            at = at.sampled_at(view, quads[again], again)
-    # The last step is so short that it changes residuals linearly.
-    at = replace(at, rest=at.rest + (at.J.swapaxes(1, 2) @ move[..., None].astype(np.float32))[..., 0])
+            at.sample_at(view, quads[again], again)
+    at = at.moved(move)
     covariance = _covariance(at, information, blur_px)
     return PatternFit(quads, covariance, at.contrast, np.sqrt(_noise_variance(at, blur_px)), step, at)
 
@@ -244,7 +237,7 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
     blur = wide = _WIDE * cell
     for _ in range(_OF_ALIGNMENT):
         at = linearised(view, quads, blur, white, grid)
-        information = at.information()
+        information = at.information
         diagonal = np.einsum('qii->qi', information)
         diagonal *= 1.0 + _DAMPING
         quads, blur = _moved(at, _step(_solvable(information), _gradient(at)), wide)
@@ -257,7 +250,7 @@ def _noise_variance(at: PatternResiduals, blur_px: float) -> FloatArray:
     Neighbouring pixels that the model misses, it misses together: as many residuals as there are independent values.
     """
     independent = _independent(at, blur_px)
-    return np.asarray((at.rest**2).mean(axis=1) * independent / np.maximum(independent - _PARAMETERS, 1.0))
+    return np.asarray((at.rest * at.weighted).mean(axis=1) * independent / np.maximum(independent - _PARAMETERS, 1.0))
 
 
 def _variance_of_samples(at: PatternResiduals, blur_px: float) -> FloatArray:
@@ -289,17 +282,17 @@ def _variance_by_patches(at: PatternResiduals, inverse: FloatArray) -> FloatArra
     The squares of what the residuals of single patches move the corners by are added (K.-Y. Liang, S. Zeger,
     "Longitudinal data analysis using generalized linear models", 1986). ``inverse`` (Q, K, K): of the information.
     """
-    moves = (inverse[:, CORNERS].astype(np.float32) @ at.J) * at.rest[:, None]
+    moves = (inverse[:, CORNERS].astype(np.float32) @ at.J) * at.weighted[:, None]
     moved = at.grid.patches(moves).sum(axis=3)
     # So much of what patches miss is left by a fit of so many parameters.
-    left = 1.0 - at.J.shape[1] / moved.shape[2]
+    left = 1.0 - (at.J.shape[1] - at.grid.background.shape[1]) / moved.shape[2]
     claimed = np.maximum(np.trace(inverse[:, CORNERS, CORNERS], axis1=1, axis2=2), TINY)
     return np.asarray((moved * moved).sum(axis=(1, 2)) / (left * claimed), dtype=np.float64)
 
 
 def _gradient(at: PatternResiduals) -> FloatArray:
     """Derivative (Q, K, 1) of half the sum of the squared residuals."""
-    return np.asarray(at.J @ at.rest[..., None], dtype=np.float64)
+    return np.asarray(-(at.J @ at.weighted[..., None]), dtype=np.float64)
 
 
 def _solvable(information: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from thermal_fiducial.core.detection.corners.blurred_patterns import (
     PatternGrid,
     PatternView,
 )
-from thermal_fiducial.core.types import changed, Float32Array, FloatArray, IntArray, Stacked, TINY
+from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, Stacked, TINY
 
 # Least local contrast, as a share of that of the whole marker: gray levels rise with counts. Without it, fits of
 # markers behind dense smoke end up to 2 px off.
@@ -32,15 +32,12 @@ class Unevenness(Stacked):
     """Level and contrast of Q markers that differ from patch to patch of a grid, beside what is linear.
 
     They differ independently, with variances that the residuals show (analysis of variance with random effects: S.
-    Searle, G. Casella, C. McCulloch, "Variance Components", 1992). Residuals have the covariance of noise and of these
-    differences. Whitened values have that of noise alone: their least squares are generalised ones.
+    Searle, G. Casella, C. McCulloch, "Variance Components", 1992). So residuals have a covariance of noise and of these
+    differences, whose inverse, for noise with a variance of 1, is I - F F^T in each patch: generalised least squares.
     """
 
-    #: (Q, n * n, P / (n * n)) the pattern without its mean in each patch, of length 1 there
-    pattern: Float32Array
-    #: (Q, 1) and (Q, n * n) shares of the mean and of the pattern in each patch that are taken out
-    of_level: Float32Array
-    of_contrast: Float32Array
+    #: (Q, n * n, P / (n * n), 2) F: a constant and the pattern without its mean, the longer the more these differ
+    differing: Float32Array
     #: (Q, n * n) what the contrast of each patch is more than the linear one
     more_contrast: Float32Array
 
@@ -54,36 +51,38 @@ class Unevenness(Stacked):
         apart_px : (Q,) distance of the samples: closer ones than a pixel are not independent
         """
         _, patches, size = rest.shape
-        centred = pattern - pattern.mean(axis=2, keepdims=True)
-        strength = np.asarray((centred * centred).sum(axis=2), dtype=np.float64)
+        centred = pattern - _sums(pattern)[..., None] / np.float32(size)
+        strength = np.asarray(_sums(centred * centred), dtype=np.float64)
         length = np.sqrt(strength + TINY)
-        unit = np.asarray(centred / length[..., None], dtype=np.float32)
-        level = np.asarray(rest.sum(axis=2) / np.sqrt(size), dtype=np.float64)
-        contrast = np.asarray((rest * unit).sum(axis=2), dtype=np.float64)
-        inside = (rest * rest).sum(axis=(1, 2)) - (level * level + contrast * contrast).sum(axis=1)
+        level = np.asarray(_sums(rest) / np.sqrt(size), dtype=np.float64)
+        contrast = np.asarray(_sums(rest * centred), dtype=np.float64) / length
+        inside = _sums(rest * rest).sum(axis=1) - (level * level + contrast * contrast).sum(axis=1)
         noise = np.maximum(inside, 0.0) / (patches * (size - 2)) / np.minimum(apart_px, 1.0) ** 2 + TINY
         noise = noise[:, None]
         of_level = _beyond(level, noise, np.ones_like(strength))
         of_contrast = _beyond(contrast, noise, strength) * strength
-        more = of_contrast / (noise + of_contrast) * contrast / length
-        shares = (1.0 - np.sqrt(noise / (noise + part)) for part in (of_level, of_contrast))
-        return Unevenness(unit, *(part.astype(np.float32) for part in (*shares, more)))
+        of_level, of_contrast = of_level / (noise + of_level), of_contrast / (noise + of_contrast)
+        differing = np.empty((*rest.shape, 2), dtype=np.float32)
+        differing[..., 0] = np.sqrt(of_level / size)[..., None]
+        np.multiply(centred, (np.sqrt(of_contrast) / length).astype(np.float32)[..., None], out=differing[..., 1])
+        return Unevenness(differing, (of_contrast * contrast / length).astype(np.float32))
 
     def left(self, rest: Float32Array) -> Float32Array:
-        """What the differences that residuals (Q, n * n, P / (n * n)) show leave of these."""
-        level, contrast = (1.0 - (1.0 - share) ** 2 for share in (self.of_level, self.of_contrast))
-        of_pattern = contrast * (rest * self.pattern).sum(axis=2)
-        shown = (level * rest.mean(axis=2))[..., None] + of_pattern[..., None] * self.pattern
-        return np.asarray(rest - shown, dtype=np.float32)
+        """What the differences that residuals (Q, n * n, P / (n * n)) show leave of these: the inverse covariance's."""
+        shown = self.differing @ (rest[:, :, None] @ self.differing).swapaxes(2, 3)
+        return np.asarray(rest - shown[..., 0])
 
-    def whitened(self, values: Float32Array) -> Float32Array:
-        """Values (Q, K, P) at the samples, whitened."""
-        count, patches, size = self.pattern.shape
-        by_patches, pattern = values.reshape(count, -1, patches, size), self.pattern[:, None]
-        together = np.ones((size, 1), dtype=np.float32)
-        level = (by_patches @ together) * (self.of_level / np.float32(size))[:, None, :, None]
-        contrast = (by_patches * pattern) @ together * self.of_contrast[:, None, :, None]
-        return np.asarray((by_patches - level - pattern * contrast).reshape(values.shape), dtype=np.float32)
+    def information(self, J: Float32Array) -> Float32Array:
+        """What of the information (Q, K, K) by derivatives (Q, K, P) the differences take."""
+        count, patches, size = self.differing.shape[:3]
+        by_patches = J.reshape(count, -1, patches, size).swapaxes(1, 2) @ self.differing
+        together = by_patches.swapaxes(1, 2).reshape(count, J.shape[1], -1)
+        return np.asarray(together @ together.swapaxes(1, 2))
+
+
+def _sums(patches: Float32Array) -> Float32Array:
+    """Sums (Q, N) over the samples of patches (Q, N, M)."""
+    return np.asarray(patches @ np.ones(patches.shape[2], dtype=np.float32))
 
 
 def _beyond(amounts: FloatArray, noise: FloatArray, strength: FloatArray) -> FloatArray:
@@ -105,34 +104,31 @@ class PatternResiduals(Stacked):
     spread: FloatArray
     #: (Q, P) gray levels, no background in them
     samples: Float32Array
-    #: (Q, P) these without the pattern, whitened
+    #: (Q, P) these without the pattern, and times their inverse covariance, for noise with a variance of 1
     rest: Float32Array
+    weighted: Float32Array
     #: (Q, L) amounts of the linear terms, the first of them the contrast
     amounts: FloatArray
-    #: (Q, 9 + L, P) derivatives of ``rest`` by the corners' u and v, by blur, and by the L linear terms
+    #: (Q, 9 + L, P) derivatives of the pattern by the corners' u and v, by blur, and by the L linear terms
     J: Float32Array
+    #: (Q, 9 + L, 9 + L) of samples with a variance of 1
+    information: FloatArray
     grid: PatternGrid
     #: None: nothing is uneven
     unevenness: Unevenness | None
 
-    def sampled_at(self, view: PatternView, quads: FloatArray, which: IntArray) -> 'PatternResiduals':
-        """The same with ``which`` (W,) at corners ``quads`` (W, 4, 2) so near that the patterns on them stay."""
-        samples = _samples(view.only(which), quads, self.grid)
-        whitened = samples
-        if self.unevenness is not None:
-            whitened = self.unevenness.only(which).whitened(samples[:, None])[:, 0]
-        amounts, rest = fitted(-self.J[which, LINEAR], whitened)
-        return replace(
-            self,
-            corners_px=changed(self.corners_px, which, quads),
-            samples=changed(self.samples, which, samples),
-            rest=changed(self.rest, which, rest),
-            amounts=changed(self.amounts, which, amounts),
-        )
+    def moved(self, step: FloatArray) -> 'PatternResiduals':
+        """The residuals after a step (Q, 9 + L) of all parameters that is so short that it changes them linearly."""
+        rest = self.rest - (self.J.swapaxes(1, 2) @ step[..., None].astype(np.float32))[..., 0]
+        return replace(self, rest=rest, weighted=_weighted(rest, self.unevenness))
 
-    def information(self) -> FloatArray:
-        """Information (Q, 9 + L, 9 + L) of samples with a variance of 1."""
-        return np.asarray(self.J @ self.J.swapaxes(1, 2), dtype=np.float64)
+    def sample_at(self, view: PatternView, quads: FloatArray, which: IntArray) -> None:
+        """Move ``which`` (W,) to corners ``quads`` (W, 4, 2) so near that the patterns on them stay."""
+        samples = _samples(view.only(which), quads, self.grid)
+        uneven = self.unevenness and self.unevenness.only(which)
+        terms, products = self.J[which, LINEAR], self.information[which, LINEAR, LINEAR]
+        self.corners_px[which], self.samples[which] = quads, samples
+        self.amounts[which], self.rest[which], self.weighted[which] = fitted(terms, products, samples, uneven)
 
     @property
     def contrast(self) -> FloatArray:
@@ -156,9 +152,11 @@ def linearised(
     to_cells = cells_by_pixels(quads, white.shape[1])
     model, spread = blurred(view, to_cells, blur, white, grid)
     samples = _samples(view, quads, grid)
-    terms = linear_terms(model, spread, grid, white.shape[1], displayed=view.displayed)
-    terms = grid.without_background(terms)
-    amounts, rest = fitted(terms, samples)
+    parts = linear_terms(model, spread, grid, white.shape[1], displayed=view.displayed)
+    J = np.empty((len(quads), LINEAR.start + sum(part.shape[1] for part in parts), samples.shape[1]), dtype=np.float32)
+    terms = np.concatenate(parts, axis=1, out=J[:, LINEAR])
+    products = products_of(terms)
+    amounts, rest, weighted = fitted(terms, products, samples, None)
     contrast = local_contrast(amounts.astype(np.float32), model, grid, displayed=view.displayed)
     uneven = None
     if view.displayed:
@@ -168,16 +166,18 @@ def linearised(
         contrast = (sign * np.maximum(sign * contrast, _LEAST_CONTRAST * whole)).astype(np.float32)
     # Steps of an alignment are long: what of the slopes looks like background is not trusted.
     slopes = model.slopes if grid.graded else grid.without_background(model.slopes)
-    by_px = to_cells.swapaxes(1, 2).astype(np.float32) @ (slopes * contrast).swapaxes(0, 1)
-    J = np.empty((len(quads), LINEAR.start + terms.shape[1], samples.shape[1]), dtype=np.float32)
+    by_px = to_cells.swapaxes(1, 2).astype(np.float32) @ (slopes * -contrast).swapaxes(0, 1)
     np.multiply(by_px[:, :, None], grid.weights, out=J[:, CORNERS].reshape(len(quads), 2, 4, -1))
-    J[:, BLUR] = -contrast * model.wider
-    J[:, : LINEAR.start] = grid.without_background(J[:, : LINEAR.start])
-    J[:, LINEAR] = -terms
+    np.multiply(contrast, model.wider, out=J[:, BLUR])
+    if not grid.graded:
+        J[:, : LINEAR.start] = grid.without_background(J[:, : LINEAR.start])
+    information = products_of(J)
     if uneven is not None:
-        J = uneven.whitened(J)
-        amounts, rest = fitted(-J[:, LINEAR], uneven.whitened(samples[:, None])[:, 0])
-    return PatternResiduals(quads, blur, to_cells, spread, samples, rest, amounts, J, grid, uneven)
+        information -= uneven.information(J)
+        amounts, rest, weighted = fitted(terms, information[:, LINEAR, LINEAR], samples, uneven)
+    return PatternResiduals(
+        quads, blur, to_cells, spread, samples, rest, weighted, amounts, J, information, grid, uneven
+    )
 
 
 def _samples(view: PatternView, quads: FloatArray, grid: PatternGrid) -> Float32Array:
@@ -187,9 +187,25 @@ def _samples(view: PatternView, quads: FloatArray, grid: PatternGrid) -> Float32
     return grid.without_background(values - values[:, :1])
 
 
-def fitted(terms: Float32Array, samples: Float32Array) -> tuple[FloatArray, Float32Array]:
-    """Amounts (Q, L) of linear terms (Q, L, P) in gray levels (Q, P), and what they leave of these."""
-    products = np.asarray(terms @ terms.swapaxes(1, 2), dtype=np.float64) + TINY * np.eye(terms.shape[1])
-    amounts = np.linalg.solve(products, terms @ samples[..., None])
+def products_of(rows: Float32Array) -> FloatArray:
+    """Sums of products (Q, K, K) of rows (Q, K, P)."""
+    return np.asarray(rows @ rows.swapaxes(1, 2), dtype=np.float64)
+
+
+def _weighted(rest: Float32Array, uneven: Unevenness | None) -> Float32Array:
+    if uneven is None:
+        return rest
+    return uneven.left(rest.reshape(uneven.differing.shape[:3])).reshape(rest.shape)
+
+
+def fitted(
+    terms: Float32Array, products: FloatArray, samples: Float32Array, uneven: Unevenness | None
+) -> tuple[FloatArray, Float32Array, Float32Array]:
+    """Amounts (Q, L) of linear terms (Q, L, P) with ``products`` (Q, L, L) in gray levels (Q, P).
+
+    And what they leave (Q, P) of these, as it is and weighted.
+    """
+    shown = terms @ _weighted(samples, uneven)[..., None]
+    amounts = np.linalg.solve(products + TINY * np.eye(terms.shape[1]), shown)
     rest = samples - (terms.swapaxes(1, 2) @ amounts.astype(np.float32))[..., 0]
-    return np.asarray(amounts[..., 0]), np.asarray(rest)
+    return np.asarray(amounts[..., 0]), np.asarray(rest), _weighted(rest, uneven)

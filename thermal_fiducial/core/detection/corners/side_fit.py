@@ -91,7 +91,8 @@ def refine_corners(
     again = refine_corners(
         image, start, camera, cells, blur_px, columns, motion.only(which), passes - 1, reach.only(which)
     )
-    return refined.with_others(which, again)
+    refined.put(which, again)
+    return refined
 
 
 def _again(
