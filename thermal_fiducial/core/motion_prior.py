@@ -55,18 +55,15 @@ class MotionPrior:
         self._stamps_ns: list[int] = []
         self._states: list[Any] = []
         self._read = read
-        self._offset_ns = round(camera_time_offset * SECOND_NS)
+        #: t_odometry = t_camera + offset_ns
+        self.offset_ns = round(camera_time_offset * SECOND_NS)
         #: whether the filter has estimated the clock offset; before that it is the parameter's
         self.clock_is_known = False
 
     def set_clock_offset(self, seconds: float) -> None:
         """Take over the filter's estimate, t_odometry = t_camera + ``seconds`` [s]."""
-        self._offset_ns = round(seconds * SECOND_NS)
+        self.offset_ns = round(seconds * SECOND_NS)
         self.clock_is_known = True
-
-    def in_odometry_clock(self, camera_stamp_ns: int) -> int:
-        """The instant of a frame in the clock of the odometry [ns]."""
-        return camera_stamp_ns + self._offset_ns
 
     def forget(self) -> None:
         """Drop all states: they are in a map that was replaced."""
@@ -133,7 +130,7 @@ def predicted_camera(
     """
     if prior is None:
         return None
-    instant_ns = prior.in_odometry_clock(camera_stamp_ns)
+    instant_ns = camera_stamp_ns + prior.offset_ns
     odometry = prior.nearest(instant_ns)
     dt = math.inf if odometry is None else (instant_ns - odometry.stamp_ns) / SECOND_NS
     if odometry is None or abs(dt) > MAX_AGE:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.geometry.se3 import skew, so3_exp, so3_log
+from thermal_fiducial.core.geometry.se3 import apply, skew, so3_exp, so3_log
 from thermal_fiducial.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -68,8 +68,7 @@ def marker_corners(sizes: npt.ArrayLike) -> FloatArray:
 
 def corners_in_map(T_map_marker: FloatArray, sizes: npt.ArrayLike) -> FloatArray:
     """Corners (..., 4, 3) [m] in the map of markers with poses (..., 4, 4) and ``sizes`` (...)."""
-    corners = marker_corners(sizes) @ T_map_marker[..., :3, :3].swapaxes(-1, -2)
-    return np.asarray(corners + T_map_marker[..., None, :3, 3])
+    return apply(T_map_marker, marker_corners(sizes))
 
 
 def reproject(camera: 'Camera', T_map_camera: FloatArray, points: FloatArray) -> FloatArray:

@@ -29,7 +29,7 @@ from thermal_fiducial.core.mapping.located import (
 from thermal_fiducial.core.mapping.map_data import MapMarker, MEMORY
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.motion_prior import PredictedCamera
-from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray, SECOND_NS
+from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
 
 #: Reason of quarantine of markers that the map file already had there.
 FROM_FILE = 'in quarantine since before the map was loaded'
@@ -64,7 +64,7 @@ def from_consistent_markers(
     fit : the pose from some of the markers
     """
     found = fit(sight)
-    if isinstance(found, Refusal) or len(found.sight.markers) != 2:
+    if isinstance(found, Refusal) or len(found.sight.sizes) != 2:
         return found
     sight, reprojection = found.sight, found.reprojection
     if not np.any(reprojection.errors_px > DISAGREEMENT * error_std_px(sight, reprojection, np.zeros((6, 6)))):
@@ -159,7 +159,7 @@ class Consistency:
     def judge(
         self,
         markers: dict[int, MapMarker],
-        known: ObjectArray,
+        ids: Sequence[int],
         errors_px: FloatArray,
         error_std_px: FloatArray,
         used: Collection[int],
@@ -169,7 +169,7 @@ class Consistency:
         Parameters
         ----------
         markers : of the map; those that enter or leave quarantine are replaced
-        known : the N of them in the frame
+        ids : the N of them in the frame
         errors_px, error_std_px : (N,) their rms re-projection errors, and the standard deviations of these
         used : IDs of those that the pose is from; trusted ones that it left out contradict odometry
 
@@ -177,11 +177,11 @@ class Consistency:
         -------
         Whether any marker entered or left quarantine.
         """
-        if len(known) < 2:
+        if len(ids) < 2:
             return False
-        ratios = errors_px / error_std_px
+        known, ratios = [markers[key] for key in ids], errors_px / error_std_px
         left_out = np.array([marker.trusted and marker.id not in used for marker in known])
-        blamed = self._blamed(ratios > DISAGREEMENT, left_out, known.tolist())
+        blamed = self._blamed(ratios > DISAGREEMENT, left_out, known)
         changed = False
         columns = blamed.tolist(), errors_px.tolist(), ratios.tolist()
         for marker, bad, error, ratio in zip(known, *columns, strict=True):

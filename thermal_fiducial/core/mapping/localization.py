@@ -264,7 +264,7 @@ class _JointFit:
         """Weights (N,) of the markers by their covariances in the map."""
         sight = self.sight
         if not sight.map_covariances.any():
-            return np.ones(len(sight.markers))
+            return np.ones(len(sight.sizes))
         variances = np.diagonal(sight.map_covariances, axis1=-2, axis2=-1)
         # A third of the variance is along each axis; a corner is 0.7 sides from the centre.
         apart = variances[:, :3].sum(axis=-1) / 3.0 + sight.sizes**2 * variances[:, 3:].sum(axis=-1) / 9.0

@@ -20,7 +20,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Observations
 from thermal_fiducial.core.motion_prior import PredictedCamera
-from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray, Stacked
+from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked
 
 #: Standard deviation of the attitude [rad] beyond which a pose is not published: a first-order covariance fails there.
 VAGUE = 0.2
@@ -35,8 +35,7 @@ class Sight(Stacked):
     observed: Observations
     #: (N,) standard deviation of a coordinate of the corners of each, rms [px]
     noise_px: FloatArray
-    #: (N,) of MapMarker, and which of them are not in quarantine
-    markers: ObjectArray
+    #: (N,) which of them are not in quarantine
     trusted: BoolArray
     #: (N, 4, 3) corners in the map [m]
     points: FloatArray
@@ -63,7 +62,6 @@ class Sight(Stacked):
         return Sight(
             observed,
             np.sqrt(np.einsum('nckk->n', observed.covariances) / 8.0),
-            np.array(known, dtype=np.object_),
             np.array([marker.trusted for marker in known], dtype=np.bool_),
             corners_in_map(T_map_marker, sizes),
             T_map_marker,

@@ -124,11 +124,11 @@ class MarkerMapper:
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
         sight = known if known.trusted.all() else known.only(known.trusted)
         outcome: Location | Refusal = Refusal('no known marker in view')
-        if len(sight.markers):
+        if len(sight.sizes):
             expected = predicted.pose if predicted is not None else self._last_at(stamp_ns)
             fit = partial(locate, stamp_ns, camera=camera, prior=expected, model=self._errors)
             outcome = from_consistent_markers(sight, camera, predicted, fit)
-        elif len(known.markers):
+        elif len(known.sizes):
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
@@ -171,14 +171,14 @@ class MarkerMapper:
             updated = True
             # Step 7: errors updated.
             self._bias.add(outcome)
-            known, (errors, error_stds) = frame.known.markers, frame.known_errors(outcome)
+            ids, (errors, error_stds) = frame.known.observed.ids.tolist(), frame.known_errors(outcome)
             if self._owns_map:
                 used = outcome.pose.marker_ids
-                changed = self._consistency.judge(self.map.markers, known, errors, error_stds, used)
+                changed = self._consistency.judge(self.map.markers, ids, errors, error_stds, used)
             # Step 8: new markers placed relative to the camera.
             if not self.frozen:
-                for marker, error in zip(known, errors.tolist(), strict=True):
-                    self.map.markers[marker.id] = self.map.markers[marker.id].observed(frame.stamp_ns, error)
+                for key, error in zip(ids, errors.tolist(), strict=True):
+                    self.map.markers[key] = self.map.markers[key].observed(frame.stamp_ns, error)
                 self._keyframes.keep(frame.observed, outcome.pose, frame.camera, frame.predicted)
                 if not frame.is_known.all():
                     placed, waiting = self._place_new(frame, outcome.viewpoint)

@@ -169,7 +169,7 @@ def predict_frame(
     if prior is None:
         return FramePrediction(track.predict(stamp_ns), None, math.inf)
     lag_ns = max(round(SECOND_NS * track.lag), _SHORTEST_LAG_NS)
-    odometry_ns = prior.in_odometry_clock(stamp_ns)
+    odometry_ns = stamp_ns + prior.offset_ns
     clock_std_s = 0.0 if prior.clock_is_known else time_offset_std
     states = prior.between(odometry_ns - _LAGS_BEFORE * lag_ns, odometry_ns + lag_ns, _STATES)
     if len(states) < _FEWEST:
