@@ -201,9 +201,8 @@ def _print_what_was_used(built: Built, frames: int, names: Sequence[str]) -> Non
         of_worst = f'{errors[worst]:.3f} px (marker {worst})'
         print(f're-projection error, median of the views: {middle:.3f} px, at worst {of_worst}')
     if built.refinement is not None:
-        for key in built.refinement.inconsistent:
-            share = 100.0 * built.refinement.outliers[key]
-            print(f'marker {key}: {share:.0f} % of its views disagree with the others; has it been moved?')
+        for key, share in built.refinement.inconsistent.items():
+            print(f'marker {key}: {100.0 * share:.0f} % of its views disagree with the others; has it been moved?')
     for key, why in sorted(built.unplaced.items()):
         print(f'marker {key} is not in the map: {why}')
 

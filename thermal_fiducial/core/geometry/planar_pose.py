@@ -1,9 +1,8 @@
-"""Pose of a marker, and of the camera from all markers of a frame, with covariances.
+"""Pose of a marker, and of the camera from all markers of a frame.
 
 A square seen in one image has two poses that explain its corners almost equally well. Both are computed in closed
 form and each is then polished by Levenberg-Marquardt on the re-projection error in the distorted image, weighted with
-the corner covariances. Covariances are ``inv(J^T W J)`` with every cross term, in the ROS convention: translation,
-then rotation, in the parent frame.
+the corner covariances.
 """
 
 from dataclasses import dataclass
@@ -31,8 +30,6 @@ class PlanarPoses:
 
     #: (N, 2, 4, 4)
     T_camera_marker: FloatArray
-    #: (N, 2, 6, 6) information matrices, ROS convention, in the camera frame
-    information: FloatArray
     #: (N, 2) re-projection error, rms over the four corners (length of the 2-vector) [px]; inf: no pose found
     rms_px: FloatArray
     #: (N, 2) weighted squared errors: with consistent corner covariances, chi-square of two degrees of freedom
@@ -53,7 +50,7 @@ class PlanarPoses:
     def ordered(self, branches: IntArray) -> 'PlanarPoses':
         """The poses with the branches in the order (N, 2)."""
         rows = np.arange(len(branches))[:, None]
-        arrays = self.T_camera_marker, self.information, self.rms_px, self.chi2
+        arrays = self.T_camera_marker, self.rms_px, self.chi2
         return PlanarPoses(*(array[rows, branches] for array in arrays))
 
 
@@ -77,14 +74,14 @@ def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArra
     once, points = Images.of(corners, whitening(corner_covs)), marker_corners(sizes[twice])
     images = Images(once.whitening[twice], once.target[twice])
     starts = ippe_square(corners.x, sizes).reshape(-1, 4, 4)
-    T, cost, information = minimise(starts, lambda T: evaluate(T, points, images), alternatives=2, linear=_LINEAR)
+    T, cost, _ = minimise(starts, lambda T: evaluate(T, points, images), alternatives=2, linear=_LINEAR)
     p = se3.apply(T, points)
     residuals = (corners.x[twice] - p[..., :2] / p[..., 2:])[..., None]
     chi2, squared_px = (((W @ residuals) ** 2).sum(axis=(1, 2, 3)) for W in (images.whitening, corners.J[twice]))
     facing = (T[:, :3, 2] * T[:, :3, 3]).sum(axis=-1) < 0.0
     found = np.isfinite(cost) & np.isfinite(chi2) & facing
     chi2, rms = (np.where(found, value, np.inf).reshape(-1, 2) for value in (chi2, np.sqrt(squared_px / 4.0)))
-    poses = PlanarPoses(T.reshape(-1, 2, 4, 4), information.reshape(-1, 2, 6, 6), rms, chi2)
+    poses = PlanarPoses(T.reshape(-1, 2, 4, 4), rms, chi2)
     first = (chi2[:, 1] < chi2[:, 0]).astype(np.intp)
     second = np.where(np.isfinite(chi2).all(axis=1), 1 - first, first)
     return poses.ordered(np.array([first, second]).T)

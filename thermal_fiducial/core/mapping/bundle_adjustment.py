@@ -47,9 +47,7 @@ class AdjustedMap:
     rms_px: float
     #: robust sum of squared whitened residuals, in units of their actual variance
     cost: float
-    #: marker ID to the share of its views that are outliers
-    outliers: dict[int, float]
-    #: the same, of adjusted markers that were moved or duplicated
+    #: adjusted markers that were moved or duplicated, by ID: the share of its views that are outliers
     inconsistent: dict[int, float]
     map_revision: int
 
@@ -119,8 +117,6 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
     covariances, draws = sources.of_markers(widened, snapshot.errors, known)
     if not np.all(np.isfinite(covariances)):
         return None
-    outlying = np.bincount(problem.marker, ~full) / np.bincount(problem.marker)
-    outliers = dict(zip(problem.ids, outlying.tolist(), strict=True))
     markers, inconsistent = {}, {}
     for i in np.flatnonzero(~problem.held).tolist():
         key, own = problem.ids[i], problem.marker == i
@@ -132,13 +128,12 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
             surveyed=False,
         )
         if two_places(now.r[own], now.J_marker[own], ~full[own]):
-            inconsistent[key] = outliers[key]
+            inconsistent[key] = float(np.mean(~full[own]))
     return AdjustedMap(
         markers,
         dict(zip(problem.stamps, now.state.T_map_camera, strict=True)),
         float(np.sqrt(np.sum(now.squared_px) / (4 * len(problem.frame)))),
         now.cost(scale) / widened,
-        outliers,
         inconsistent,
         snapshot.map_revision,
     )

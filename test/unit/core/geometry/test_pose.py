@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.pose_information import information_of_poses
 
 from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.core.geometry import se3
@@ -194,7 +195,7 @@ def test_marker_covariance_is_consistent():
     error = np.concatenate(
         [T[:3, 3] - found[:, :3, 3], se3.so3_log(T[:3, :3] @ np.swapaxes(found[:, :3, :3], -1, -2))], axis=-1
     )
-    nees = np.einsum('bi,bij,bj->b', error, poses.information[:, 0], error)
+    nees = np.einsum('bi,bij,bj->b', error, information_of_poses(camera, found, covs, 0.3), error)
     # Chi-square of 6: standard deviation of the mean over 2000 is 0.08; 4 of them.
     assert np.mean(nees) == pytest.approx(6.0, abs=0.31)
     assert np.mean(poses.chi2[:, 0]) == pytest.approx(2.0, abs=0.18)
