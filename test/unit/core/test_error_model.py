@@ -194,9 +194,12 @@ def test_a_model_without_errors_adds_nothing():
 
 # Without a field the estimate falls from its start at 0.1 px, and is within the bound of none after 450 frames; after
 # 300 it is too low for a field of 0.08 px, so that one that learned nothing of the field would fail with it too. Errors
-# of each corner that the detector knows of must not hide the field.
-@pytest.mark.parametrize(('true_px', 'frames', 'known_px'), [(0.0, 600, 0.0), (0.08, 300, 0.0), (0.08, 300, 0.1)])
-def test_the_bias_of_the_corners_is_learned_from_correlated_residuals(true_px, frames, known_px):
+# of each corner that the detector knows of must not hide the field. Twice a second markers are elsewhere in the image.
+@pytest.mark.parametrize(
+    ('true_px', 'frames', 'known_px', 'rate_hz'),
+    [(0.0, 600, 0.0, 30), (0.08, 300, 0.0, 30), (0.08, 300, 0.1, 30), (0.0, 150, 0.0, 2), (0.2, 150, 0.0, 2)],
+)
+def test_the_bias_of_the_corners_is_learned_from_correlated_residuals(true_px, frames, known_px, rate_hz):
     """Corners with noise of 0.1 px, and with a smooth field over the image or without."""
     rng = np.random.default_rng(4)
     poses, model = wall(rng), replace(ERRORS, corner_px=max(true_px, 1e-6))
@@ -207,15 +210,16 @@ def test_the_bias_of_the_corners_is_learned_from_correlated_residuals(true_px, f
         MarkerMapperConfig(mode='localization'), MarkerMap({i: MapMarker(i, SIZE, True, T) for i, T in poses.items()})
     )
     for k in range(frames):
-        rows = see(flight(k / 30), poses, 0.1, rng)
+        rows = see(flight(k / rate_hz), poses, 0.1, rng)
         rows['detector_px'] = known_px
         corners = corners_px(rows).reshape(-1, 2)
         nearest = np.argmin(np.sum((corners[:, None] - grid) ** 2, axis=-1), axis=1)
         for name, column in zip(CORNER_FIELDS, (corners + field[nearest]).reshape(-1, 8).T, strict=True):
             rows[name] = column
-        m.process(stamp(k), rows, CAMERA)
-    # A flight sees a few independent pieces of one field, so the estimate is good to a third.
-    assert abs(m.corner_bias_px - true_px) < 0.035
+        m.process(stamp(k * 30 // rate_hz), rows, CAMERA)
+    # A flight sees a few independent pieces of one field: over eight fields of 0.2 px the estimate scatters by
+    # 0.046 px, at 30, 10, 5, 2 and 0.7 Hz alike. Two sigma.
+    assert abs(m.corner_bias_px - true_px) < max(0.035, 0.46 * true_px)
 
 
 def test_a_partially_visible_marker_does_not_change_the_bias():

@@ -21,8 +21,6 @@ LARGEST_SHAPE = CHI2_OF_VIEW / 8.0
 SHAPE_VISIBLE = 0.75
 #: Fewest markers for the corner bias: the pose absorbs nearly all of the error of fewer.
 FEWEST_MARKERS = 3
-# Longest time between frames whose residuals are compared [ns]: later the corners are elsewhere in the image.
-_SUCCESSIVE_NS = 150_000_000
 
 
 class CornerBias:
@@ -31,9 +29,10 @@ class CornerBias:
     White noise of two frames is independent, so the mean product of a corner's residuals in successive frames is the
     variance of the systematic error, less the part that the pose absorbs: most of an error that is smooth over the
     image, hardly any of errors that each corner has for itself. These the detector claims in the corners' noise
-    already; the rest is the bias. Without the mean over each marker's corners the product is that of the markers'
-    shapes. Errors of partially visible markers are correlated for other reasons; in the bias markers are weighted by
-    their claimed noise.
+    already; the rest is the bias. Where the image has moved since the last frame, the two have less of the smooth error
+    in common, and the pair counts for less. Without the mean over each marker's corners the product is that of the
+    markers' shapes. Errors of partially visible markers are correlated for other reasons; in the bias markers are
+    weighted by their claimed noise.
     """
 
     def __init__(self) -> None:
@@ -51,7 +50,7 @@ class CornerBias:
         # Markers with more noise than the frame's median have less weight.
         shares = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2)
         self._last = location, shares
-        if last is None or not 0 < location.pose.stamp_ns - last.pose.stamp_ns < _SUCCESSIVE_NS:
+        if last is None or location.pose.stamp_ns <= last.pose.stamp_ns:
             return
         places = {key: place for place, key in enumerate(last.pose.marker_ids)}
         now = [place for place, key in enumerate(location.pose.marker_ids) if key in places]
@@ -66,18 +65,13 @@ class CornerBias:
         # Residuals of moved or mistaken markers are correlated too.
         limit = min(INCONSISTENT_PX, BIAS_OUTLIER * self.px) ** 2
         bound = np.minimum(1.0, limit / np.maximum(np.abs(products), TINY))
-        weights, scale = (np.repeat(np.sqrt(values), 4)[:, None] for values in (shares, shares * bound))
-        modes = weights * location.lens.modes[now].reshape(len(weights), -1)
-        shown = shown_errors(
-            weights[..., None] * location.reprojection.J_camera[now].reshape(-1, 2, 6),
-            modes @ modes.T,
-            scale * residuals.reshape(-1, 2),
-            scale * former.reshape(-1, 2),
+        shown, common = shown_errors(
+            *(_FittedCorners.of(of, chosen, shares, bound) for of, chosen in ((location, now), (last, then)))
         )
         known = shown.own * float(shares @ location.sight.observed.detector_px[now] ** 2) / len(now)
-        sums = (1.0, shares.mean(), of_shape.mean() / SHAPE_VISIBLE, known, *shown)
-        self._sums = BIAS_MEMORY * self._sums + sums
-        frames, weight, shapes, known, *sums_shown = self._sums.tolist()
+        sums = common * np.array((shares.mean(), known, *shown))
+        self._sums = BIAS_MEMORY * self._sums + (1.0, of_shape.mean() / SHAPE_VISIBLE, *sums)
+        frames, shapes, weight, known, *sums_shown = self._sums.tolist()
         prior = SystematicErrors()
         self.px = _learned(prior.corner_px, ShownErrors(*sums_shown).smooth_variance(known), weight)
         # Not all that lasts until the next frame is alike in all views: the shape is never more than at first.
@@ -90,7 +84,7 @@ def _learned(prior: float, variance: float, frames: float) -> float:
 
 
 class ShownErrors(NamedTuple):
-    """What residuals of a pose show of the corners' systematic errors: sums per coordinate.
+    """What residuals of two poses show of the corners' systematic errors: sums per coordinate.
 
     If each corner has an error of its own, of variance s^2, and all share one that is smooth over the image, of
     variance b^2, ``product`` is expected to be ``s^2 own + b^2 smooth`` and ``smooth_product``
@@ -111,28 +105,53 @@ class ShownErrors(NamedTuple):
         Errors of single corners beyond what the detector declares are attributed to the smooth error of the lens: a
         model that is wrong within a marker is worse over the whole image, where the pose hides it.
         """
+        if self.smooth == 0.0:
+            return 0.0
         own = (self.product * self.both - self.smooth_product * self.smooth) / (self.own * self.both - self.smooth**2)
         return (self.product - min(max(own, 0.0) * self.own, known)) / self.smooth
 
 
-def shown_errors(J: FloatArray, correlations: FloatArray, residuals: FloatArray, former: FloatArray) -> ShownErrors:
-    """What the residuals (n, 2) [px] of n corners and the ``former`` ones of the same corners show.
+class _FittedCorners(NamedTuple):
+    """Weighted corners of a frame, two coordinates each, with the smooth error before and after a fit of the pose."""
 
-    Parameters
-    ----------
-    J : (n, 2, 6) derivatives of the corners with respect to the pose
-    correlations : (n, n) of the smooth error
+    #: (2 n,) [px]
+    residuals: FloatArray
+    #: (2 n, 6) orthonormal directions, along which the pose takes up errors
+    taken_up: FloatArray
+    #: (2 n, 2 I) derivatives of the errors by the factors of the smooth one, before the fit and after it
+    smooth: FloatArray
+    left: FloatArray
+
+    @classmethod
+    def of(cls, location: Location, chosen: list[int], shares: FloatArray, bound: FloatArray) -> '_FittedCorners':
+        """The ``chosen`` (m,) markers of a frame, with weights (m,), and further ones (m,) of their residuals."""
+        weights, scale = (np.repeat(np.sqrt(values), 8) for values in (shares, shares * bound))
+        J = location.reprojection.J_camera[chosen].reshape(-1, 6)
+        taken_up = np.linalg.qr(weights[:, None] * J)[0]
+        modes = location.lens.modes[chosen].reshape(len(J) // 2, -1)
+        smooth = np.zeros((len(modes), 2, modes.shape[1], 2))
+        smooth[:, 0, :, 0] = smooth[:, 1, :, 1] = modes
+        smooth = weights[:, None] * smooth.reshape(len(J), -1)
+        residuals = scale * location.reprojection.residuals[chosen].ravel()
+        return cls(residuals, taken_up, smooth, smooth - taken_up @ (taken_up.T @ smooth))
+
+
+def shown_errors(now: _FittedCorners, former: _FittedCorners) -> tuple[ShownErrors, float]:
+    """What the residuals of n corners and the ``former`` ones of the same corners show.
+
+    Returns
+    -------
+    that, and the share, 0 to 1, of the smooth error in the present residuals that was in the former ones
     """
-    n = len(J)
-    # The pose takes up errors along six orthonormal directions.
-    directions = np.linalg.qr(J.reshape(2 * n, 6))[0]
-    correlated = (correlations @ directions.reshape(n, 12)).reshape(2 * n, 6)
-    taken_up = directions.T @ correlated
+    n = len(now.residuals) // 2
+    both = np.vdot(now.left.T @ now.left, former.left.T @ former.left)
+    smooth = float(np.vdot(now.left, former.left))
     sums = (
-        np.vdot(residuals, former),
-        np.vdot(residuals, correlations @ former),
-        2.0 * n - 6.0,
-        2.0 * correlations.trace() - taken_up.trace(),
-        2.0 * np.vdot(correlations, correlations) - 2.0 * np.vdot(correlated, correlated) + np.vdot(taken_up, taken_up),
+        np.vdot(now.residuals, former.residuals),
+        np.vdot(now.residuals @ now.smooth, former.residuals @ former.smooth),
+        2.0 * n - 12.0 + np.square(now.taken_up.T @ former.taken_up).sum(),
+        smooth,
+        both,
     )
-    return ShownErrors(*(float(value) / (2.0 * n) for value in sums))
+    common = smooth / max(float(np.vdot(now.left, now.left)), TINY)
+    return ShownErrors(*(float(value) / (2.0 * n) for value in sums)), min(max(common, 0.0), 1.0)
