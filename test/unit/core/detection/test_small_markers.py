@@ -18,6 +18,7 @@ from thermal_fiducial.cli.marker_measurement import camera_and_detector, show
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.blurred_patterns import lens_bends, pattern_grid, PatternView
 from thermal_fiducial.core.detection.corners.pattern_fit import evidence_of, fit_patterns, nearness
+from thermal_fiducial.core.detection.corners.pattern_residuals import products_of, Unevenness
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -333,6 +334,19 @@ def test_samples_are_ordered_by_patches():
     # The weights of the two corners on the right are together the share along the row.
     right = grid.by_rows(grid.weights[1] + grid.weights[2])
     np.testing.assert_allclose(right, np.tile(grid.along / 6.0, (21, 1)), atol=1e-6)
+
+
+def test_information_and_residuals_have_the_same_covariance():
+    """The inverse covariance takes as much of the information by rows as of the products of these with residuals."""
+    rng, grid = np.random.default_rng(4), pattern_grid(6, 3)
+    pattern, rest, *rows = rng.normal(size=(5, 2, grid.weights.shape[1])).astype(np.float32)
+    # Patches differ.
+    rest += np.repeat(rng.normal(0.0, 3.0, (2, 49)), 9, axis=1).astype(np.float32) * (1.0 + pattern)
+    uneven, J = Unevenness.shown(grid.patches(pattern), grid.patches(rest), np.ones(2)), np.stack(rows, axis=1)
+    weighted = np.stack([uneven.left(grid.patches(row)).reshape(row.shape) for row in rows], axis=1)
+    # Rounding of single precision: 1e-5 of the information.
+    np.testing.assert_allclose(products_of(J) - uneven.information(J), J @ weighted.swapaxes(1, 2), atol=5e-3)
+    assert np.trace(uneven.information(J), axis1=1, axis2=2).min() > 100.0
 
 
 @pytest.mark.parametrize(('blurs', 'nearer'), [(3.0, 0), (9.0, 0), (14.0, 1), (40.0, 2)])

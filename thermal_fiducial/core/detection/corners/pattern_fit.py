@@ -63,6 +63,10 @@ _STEPS, _CONVERGED_PX = 8, 0.02
 # out of focus would be off by 0.5 to 1.3 per mille. The pattern of a blur that is a third too small makes them 4 per
 # mille too large, and the error is a square.
 _SAME_PX, _SAME_BLUR = 0.1, 0.05
+# The same where cells are wider than so many blurs of optics and motion: a blur that is wrong displaces no edge there.
+# With 0.3, or from 6 blurs on, markers are up to 0.02 px smaller. A blur takes many steps to find, as gray scales that
+# are bent bend edges alike.
+_ALONE, _SAME_ALONE = 7.5, 0.2
 # Steps of an alignment. Damping: share of the information's diagonal that is added to it.
 _OF_ALIGNMENT, _DAMPING = 3, 0.1
 # Blur of the pattern in an alignment, so wide that it reaches an edge half a cell away [cells].
@@ -201,13 +205,16 @@ def fit_patterns(
     density = max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX))
     grid = pattern_grid(decoder.cells, min(density, _MOST), nearer)
     prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
+    blurs_px = blur_px if view.motion is None else np.hypot(blur_px, np.hypot(*view.motion.T))
+    alone = widths(quads) > _ALONE * blurs_px * decoder.cells
+    same_px, same_blur = (np.where(alone, _SAME_ALONE, same) for same in (_SAME_PX, _SAME_BLUR))
     at = linearised(view, quads.copy(), blur, white, grid)
     for left in reversed(range(_STEPS)):
         information, product = prior.normal_equations(at)
         move = _step(information, product)
         quads, blur = _moved(at, move, blur_px)
         step = np.abs(quads - at.corners_px).max(axis=(1, 2))
-        far = (step > _SAME_PX) | (np.abs(blur - at.blur) > _SAME_BLUR * blur_px)
+        far = (step > same_px) | (np.abs(blur - at.blur) > same_blur * blur_px)
         anew, again = np.flatnonzero(far), np.flatnonzero(~far & (step > _CONVERGED_PX))
         if left == 0 or not len(anew) + len(again):
             break

@@ -171,7 +171,10 @@ def linearised(
     np.multiply(contrast, model.wider, out=J[:, BLUR])
     if not grid.graded:
         J[:, : LINEAR.start] = grid.without_background(J[:, : LINEAR.start])
-    information = products_of(J)
+    information = np.empty((len(J), J.shape[1], J.shape[1]))
+    information[:, LINEAR, LINEAR] = products
+    information[:, : LINEAR.start] = J[:, : LINEAR.start] @ J.swapaxes(1, 2)
+    information[:, LINEAR, : LINEAR.start] = information[:, : LINEAR.start, LINEAR].swapaxes(1, 2)
     if uneven is not None:
         information -= uneven.information(J)
         amounts, rest, weighted = fitted(terms, information[:, LINEAR, LINEAR], samples, uneven)

@@ -22,7 +22,7 @@ from thermal_fiducial.core.detection.corners.corner_errors import of_motion_blur
 from thermal_fiducial.core.detection.corners.gray_scale import GrayScale
 from thermal_fiducial.core.detection.corners.pattern_fit import fitted_patterns, nearness, too_blurred_for_sides
 from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
-from thermal_fiducial.core.detection.corners.side_fit import OF_CLEAR, OF_FAINT, refine_corners
+from thermal_fiducial.core.detection.corners.side_fit import OF_CLEAR, OF_FAINT, PASSES, refine_corners
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.prediction.frame import (
     delays,
@@ -138,7 +138,11 @@ def _measured(
     if whole.all():
         return _by_patterns(frame, found, start, blur, decoder, config)
     others, of_sides = start.only(~whole), blur.only(~whole)
-    refined = refine_corners(frame.image, others, frame.camera, decoder.cells, config.blur_px, columns, of_sides)
+    # On displays sides are where fits of patterns begin.
+    passes = 1 if frame.displayed else PASSES
+    refined = refine_corners(
+        frame.image, others, frame.camera, decoder.cells, config.blur_px, columns, of_sides, passes
+    )
     if frame.displayed:
         # Fits of large patterns do not converge from corners that are off by half a cell.
         px = start.px.copy()

@@ -39,9 +39,10 @@ OF_CLEAR, OF_FAINT = 6, 12
 _EYE = np.eye(2)
 # Indices of the corners, clockwise, among the ends of the sides.
 _CORNERS = np.array([0, 1, 3, 2])
-# Largest number of passes. A corner has converged when its last step is below _UNSURE of its standard deviations,
-# clipped to the limits _SETTLED_PX [px].
-_PASSES = 4
+#: Largest number of passes.
+PASSES = 4
+# A corner has converged when its last step is below _UNSURE of its standard deviations, clipped to the limits
+# _SETTLED_PX [px].
 _SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
 
 
@@ -53,7 +54,7 @@ def refine_corners(
     blur_px: float,
     columns: int = OF_CLEAR,
     motion: MotionBlur | None = None,
-    passes: int = _PASSES,
+    passes: int = PASSES,
     reach: Reach | None = None,
 ) -> RefinedCorners:
     """Corners of N markers; those that have not converged are refined again, in so many passes at most.
