@@ -5,7 +5,6 @@ about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that t
 ``p = p_hat + d[:3]`` and ``R = exp(d[3:]) @ R_hat``.
 """
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -162,9 +161,9 @@ class Observations(Stacked):
         uu, uv, vv = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
         sound = (uu > 0.0) & (uu * vv > uv**2) & np.isfinite(corners).all(axis=2)
         usable: BoolArray = np.asarray(sound.all(axis=1))
-        times = Counter(observations.ids.tolist())
-        if len(times) < len(markers):
-            usable &= np.array([times[key] == 1 for key in observations.ids.tolist()])
+        ids = observations.ids.tolist()
+        if len(set(ids)) < len(ids):
+            usable &= np.array([ids.count(key) == 1 for key in ids])
         return observations if usable.all() else observations.only(usable)
 
 

@@ -1,6 +1,6 @@
 """Array types shared by the core, and records that are made of them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Self, TypeAlias
 
@@ -30,31 +30,32 @@ class Stacked:
 
     def only(self, keep: BoolArray | IntArray) -> Self:
         """The items at ``keep``."""
-        return self._of(_at(field, keep) for field in self._fields())
+        return self._changed(lambda values: values[keep])
 
     def joined(self, others: Self) -> Self:
         """These items and those of ``others``."""
-        pairs = zip(self._fields(), others._fields(), strict=True)
-        return self._of(a.joined(b) if isinstance(a, Stacked) else np.concatenate([a, b]) for a, b in pairs)
+        return self._changed(lambda *both: np.concatenate(both), others)
 
     def put(self, which: IntArray, others: Self) -> None:
         """Put ``others`` in the place of the items at ``which``, in their order."""
-        for field, there in zip(self._fields(), others._fields(), strict=True):
+        names: tuple[str, ...] = self.__slots__
+        for name in names:
+            field, there = getattr(self, name), getattr(others, name)
             if isinstance(field, Stacked):
                 field.put(which, there)
             elif isinstance(field, np.ndarray):
                 field[which] = there
 
-    def _fields(self) -> list[Any]:
-        names: tuple[str, ...] = self.__slots__
-        return [getattr(self, name) for name in names]
-
-    def _of(self, fields: Iterable[Any]) -> Self:
+    def _changed(self, change: Callable[..., Any], *others: Self) -> Self:
+        """The batch with each array, also of batches in it, changed by what ``others`` have in its place."""
         make: Callable[..., Self] = type(self)
+        names: tuple[str, ...] = self.__slots__
+        fields = []
+        for name in names:
+            field, *theirs = (getattr(batch, name) for batch in (self, *others))
+            if isinstance(field, Stacked):
+                field = field._changed(change, *theirs)
+            elif isinstance(field, np.ndarray):
+                field = change(field, *theirs)
+            fields.append(field)
         return make(*fields)
-
-
-def _at(field: Any, keep: BoolArray | IntArray) -> Any:
-    if isinstance(field, Stacked):
-        return field.only(keep)
-    return field[keep] if isinstance(field, np.ndarray) else field

@@ -42,7 +42,7 @@ class Input:
         self.left = self._left_before = 0
         # The publisher's number of the message that was taken last; 0: not known.
         self._number = 0
-        #: of rclpy
+        #: of rclpy: what is counted
         self.subscription: Any = None
 
     def newest(self, message: Any, at_most: int) -> Any:
@@ -73,10 +73,6 @@ class Input:
         """Number of messages skipped since the last call."""
         left, self._left_before = self.left - self._left_before, self.left
         return left
-
-    def attach(self, subscription: Any) -> None:
-        """Set the subscription that is counted."""
-        self.subscription = subscription
 
     def take(self) -> tuple[Any, dict[str, Any]] | None:
         """Take and count the oldest queued message; returns it and rclpy's information on it, None if there is none."""
@@ -129,7 +125,7 @@ class CountingNode(Node):
             source.count += 1
             self.guard(callback, message)
 
-        source.attach(self.create_subscription(kind, topic, receive, profile, raw=raw))
+        source.subscription = self.create_subscription(kind, topic, receive, profile, raw=raw)
         self.inputs.append(source)
         return source
 
@@ -147,7 +143,7 @@ class CountingNode(Node):
             source.count += 1
             self.guard(callback, source.newest(message, profile.depth))
 
-        source.attach(self.create_subscription(kind, topic, receive, profile, raw=raw))
+        source.subscription = self.create_subscription(kind, topic, receive, profile, raw=raw)
         self.inputs.append(source)
         return source
 
@@ -158,7 +154,7 @@ class CountingNode(Node):
         """
         source = Input(self.resolve_topic_name(topic))
         subscription = self.create_subscription(kind, topic, callback, profile, raw=True)
-        source.attach(subscription)
+        source.subscription = subscription
         self.inputs.append(source)
         self.lazy[subscription] = source
         return source
