@@ -8,18 +8,21 @@ import pytest
 from support import approach
 from support.detector_scores import odometry_before
 
+from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.blurred_patterns import PatternView
 from thermal_fiducial.core.detection.corners.corner_errors import OF_LAG_FORM, of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.corners.gray_scale import UNKNOWN_SCALE
-from thermal_fiducial.core.detection.corners.pattern_fit import fit_patterns, too_blurred_for_sides
+from thermal_fiducial.core.detection.corners.pattern_fit import fit_patterns, nearness, too_blurred_for_sides
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.prediction.frame import (
     counts_of,
+    Frame,
     LAG_TAIL_AGE,
     lag_tail_maps,
     MotionBlur,
     Places,
     REMAINING,
+    Saturation,
     SPREAD,
 )
 from thermal_fiducial.core.detection.prediction.twist import Twist
@@ -210,6 +213,40 @@ def test_a_marker_in_motion_shows_the_gray_scale_of_a_display(cell, lag_blur, be
     zero_and_unit = np.polyfit(scale.counts[levels], true, 1)
     # When written at most 0.014, 0.005 and 0.030 of the contrast; a linear scale is off by 0.106, 0 and 0.068.
     assert np.abs(np.polyval(zero_and_unit, scale.counts[levels]) - true).max() < allowed
+
+
+@pytest.mark.parametrize(
+    ('cell', 'lag_blur', 'white', 'allowed'),
+    [(7, (1.7, 0.0), 0.75, 0.04), (7, (3.0, 0.0), 0.5, 0.04), (9, (4.0, 2.0), 0.75, 0.13)],
+)
+def test_what_a_display_saturates_is_no_count(cell, lag_blur, white, allowed):
+    """A warm marker comes into view before the gray scale has followed: white are all counts above a share of it."""
+    decoder, image, corners = lagging(cell, lag_blur, beyond=0.3)
+    noise = np.random.default_rng(0).normal(0.0, 0.7, image.shape)
+    gray = np.clip(np.rint(20.0 + 235.0 * image / white + noise), 0, 255).astype(np.uint8)
+    frame = Frame.of(0, gray, Camera(*gray.shape[::-1], np.eye(3)), None, ArucoDetectorConfig(), keep_columns=True)
+    lag = np.broadcast_to(lag_blur, corners.shape)
+    there, to_tails, spread = (
+        corners + REMAINING * lag,
+        lag_tail_maps(corners + REMAINING * lag, lag),
+        SPREAD * lag[:, 0],
+    )
+    view = PatternView(frame.image, to_tails, spread, displayed=True, saturation=frame.saturation())
+    near = int(nearness(there, decoder.cells, np.hypot(BLUR_PX, np.hypot(*spread.T)))[0])
+    fit = fit_patterns(view, there + 0.5, MARKER, decoder, BLUR_PX, near)
+    # When written 0.024, 0.018 and 0.106 px; where gray levels of what is saturated count, 0.125, 0.330 and 0.235 px.
+    assert np.sqrt(np.mean(np.square(fit.corners_px - there))) < allowed
+
+
+@pytest.mark.parametrize(
+    ('now', 'then', 'later', 'known'),
+    [(0, 0, 0, 1), (1, 0, 0, 1), (0, 1, 0, 0), (1, 1, 0, 0), (1, 1, 1, 1), (-1, -1, 0, 0), (1, -1, 0, 1)],
+)
+def test_a_saturated_pixel_without_its_lag_tail(now, then, later, known):
+    """Pixels at a place, where their lag tails are, and as far on the other side."""
+    saturation = Saturation(np.array([[then, now, later]], dtype=np.float32), 0.0, 255.0)
+    places, tails = np.array([[[1.0]], [[0.0]]], dtype=np.float32), np.zeros((2, 1, 1), dtype=np.float32)
+    assert saturation.known(places, tails).item() == bool(known)
 
 
 BLUR_PX, MARKER = np.hypot(0.6, 12**-0.5), np.array([13])

@@ -21,10 +21,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.prediction.frame import without_tails
+from thermal_fiducial.core.detection.prediction.frame import lag_tails, Saturation, without_tails
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
-from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, TINY
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY
 
 # Place of the end of the warm surface outside the sides [cells].
 _SURFACE_ENDS = 1.0
@@ -157,6 +157,8 @@ class PatternView(NamedTuple):
     displayed: bool = False
     #: (Q, 2, 16) of :func:`lens_bends`; None: straight lines are straight in the image
     bends: FloatArray | None = None
+    #: where the gray scale ends; None: nowhere, or it does not matter
+    saturation: Saturation | None = None
 
     def only(self, which: IntArray) -> 'PatternView':
         """The view of some markers."""
@@ -166,15 +168,28 @@ class PatternView(NamedTuple):
 
     def values(self, quads: FloatArray, grid: PatternGrid) -> Float32Array:
         """Values (Q, P) at the samples of markers in ``quads`` (Q, 4, 2)."""
+        places = self._places(quads, grid)
+        shown = self._at(places)
+        if self.to_tails is not None:
+            shown = without_tails(shown, self._at(lag_tails(places, self.to_tails)))
+            if self.saturation is not None:
+                shown = self.saturation.cut(shown)
+        return shown
+
+    def known(self, quads: FloatArray, grid: PatternGrid) -> BoolArray:
+        """Which samples (Q, P) of markers in ``quads`` (Q, 4, 2) are known."""
+        places = self._places(quads, grid)
+        if self.saturation is None:
+            return np.ones(places.shape[1:], dtype=np.bool_)
+        if self.to_tails is None:
+            return np.asarray(self.saturation.at(places) == 0.0)
+        return self.saturation.known(places, lag_tails(places, self.to_tails))
+
+    def _places(self, quads: FloatArray, grid: PatternGrid) -> Float32Array:
         places = seen_between(quads, grid.weights)
         if self.bends is not None:
             places += (self.bends.astype(np.float32) @ grid.between_nodes).swapaxes(0, 1)
-        shown = self._at(places)
-        if self.to_tails is not None:
-            maps = self.to_tails.transpose(1, 2, 0)[..., None].astype(np.float32)
-            tails = maps[:, 0] * places[0] + maps[:, 1] * places[1] + maps[:, 2]
-            shown = without_tails(shown, self._at(tails))
-        return shown
+        return places
 
     def _at(self, places: Float32Array) -> Float32Array:
         u, v = places

@@ -19,7 +19,7 @@ from thermal_fiducial.core.detection.corners.blurred_patterns import (
     pattern_grid,
     PatternView,
 )
-from thermal_fiducial.core.detection.corners.pattern_residuals import fitted, products_of, Unevenness
+from thermal_fiducial.core.detection.corners.pattern_residuals import blank, fitted, products_of, Unevenness
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, TINY
 
@@ -59,7 +59,7 @@ class GrayScale(NamedTuple):
 
         Parameters
         ----------
-        view : of gray levels, with the whole lag
+        view : of gray levels, with the whole lag; what is saturated has no counts
         corners_px : (N, 4, 2) in it
         blur_px : standard deviation of the blur of optics and pixels
         """
@@ -67,14 +67,16 @@ class GrayScale(NamedTuple):
         to_cells = cells_by_pixels(corners_px, decoder.cells)
         model, spread = blurred(view, to_cells, np.full(len(ids), blur_px), white, grid)
         terms = np.concatenate(linear_terms(model, spread, grid, decoder.cells, displayed=False), axis=1)
+        known = view.known(corners_px, grid)
+        blank(terms, known)
         products = products_of(terms)
         gray, pattern, apart_px = view.values(corners_px, grid), grid.patches(model.value), grid.apart_px(to_cells)
         scale = self
         for _ in range(_ROUNDS):
             counts = np.interp(gray, _LEVELS, scale.counts).astype(np.float32)
-            rest = grid.patches(fitted(terms, products, counts - counts[:, :1], None)[1])
-            left = Unevenness.shown(pattern, rest, apart_px).left(rest)
-            scale = _by_means(counts.ravel() - left.ravel(), gray.ravel(), scale)
+            rest = grid.patches(fitted(terms, products, (counts - counts[:, :1]) * known, None)[1])
+            left = Unevenness.shown(pattern, rest, grid.patches(known.astype(np.float32)), apart_px).left(rest)
+            scale = _by_means((counts - left.reshape(counts.shape))[known], gray[known], scale)
         return scale
 
 
@@ -87,6 +89,8 @@ def _by_means(counts: Float32Array, gray: Float32Array, before: GrayScale) -> Gr
 
     Counts get the mean and the deviation of the gray levels. Beyond all pixels the gray scale is linear.
     """
+    if len(counts) < _FEWEST:
+        return before
     part = (_PARTS - 1e-3) * (counts - counts.min()) / (np.ptp(counts) + TINY)
     bins = part.astype(np.int64)
     number = np.bincount(bins, minlength=_PARTS)

@@ -206,9 +206,10 @@ def fit_patterns(
     grid = pattern_grid(decoder.cells, min(density, _MOST), nearer)
     prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
     blurs_px = blur_px if view.motion is None else np.hypot(blur_px, np.hypot(*view.motion.T))
-    alone = widths(quads) > _ALONE * blurs_px * decoder.cells
-    same_px, same_blur = (np.where(alone, _SAME_ALONE, same) for same in (_SAME_PX, _SAME_BLUR))
     at = linearised(view, quads.copy(), blur, white, grid)
+    # Which samples are known changes with the corners.
+    alone = (widths(quads) > _ALONE * blurs_px * decoder.cells) & at.known.all(axis=1)
+    same_px, same_blur = (np.where(alone, _SAME_ALONE, same) for same in (_SAME_PX, _SAME_BLUR))
     for left in reversed(range(_STEPS)):
         information, product = prior.normal_equations(at)
         move = _step(information, product)
@@ -257,12 +258,13 @@ def _noise_variance(at: PatternResiduals, blur_px: float) -> FloatArray:
     Neighbouring pixels that the model misses, it misses together: as many residuals as there are independent values.
     """
     independent = _independent(at, blur_px)
-    return np.asarray((at.rest * at.weighted).mean(axis=1) * independent / np.maximum(independent - _PARAMETERS, 1.0))
+    mean_square = (at.rest * at.weighted).sum(axis=1) / at.number
+    return np.asarray(mean_square * independent / np.maximum(independent - _PARAMETERS, 1.0))
 
 
 def _variance_of_samples(at: PatternResiduals, blur_px: float) -> FloatArray:
     """Variance (Q,) that samples would have, were they independent and said as much as the pixels."""
-    return np.asarray(_noise_variance(at, blur_px) * at.samples.shape[1] / at.pixels)
+    return np.asarray(_noise_variance(at, blur_px) / at.grid.apart_px(at.to_cells) ** 2)
 
 
 def _independent(at: PatternResiduals, blur_px: float) -> FloatArray:

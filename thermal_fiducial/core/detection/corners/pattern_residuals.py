@@ -20,7 +20,7 @@ from thermal_fiducial.core.detection.corners.blurred_patterns import (
     PatternGrid,
     PatternView,
 )
-from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, Stacked, TINY
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked, TINY
 
 # Least local contrast, as a share of that of the whole marker: gray levels rise with counts. Without it, fits of
 # markers behind dense smoke end up to 2 px off.
@@ -42,28 +42,32 @@ class Unevenness(Stacked):
     more_contrast: Float32Array
 
     @staticmethod
-    def shown(pattern: Float32Array, rest: Float32Array, apart_px: FloatArray) -> 'Unevenness':
+    def shown(pattern: Float32Array, rest: Float32Array, known: Float32Array, apart_px: FloatArray) -> 'Unevenness':
         """What residuals show.
 
         Parameters
         ----------
-        pattern, rest : (Q, n * n, P / (n * n)) the blurred pattern, and residuals
+        pattern, rest : (Q, n * n, P / (n * n)) the blurred pattern, and residuals, 0 where they are not known
+        known : of the same shape, 1 for samples that are known, else 0
         apart_px : (Q,) distance of the samples: closer ones than a pixel are not independent
         """
-        _, patches, size = rest.shape
-        centred = pattern - _sums(pattern)[..., None] / np.float32(size)
+        number = np.asarray(_sums(known), dtype=np.float64)
+        some = np.maximum(number, 1.0)
+        means = np.asarray(_sums(pattern * known) / some, dtype=np.float32)
+        centred = (pattern - means[..., None]) * known
         strength = np.asarray(_sums(centred * centred), dtype=np.float64)
         length = np.sqrt(strength + TINY)
-        level = np.asarray(_sums(rest) / np.sqrt(size), dtype=np.float64)
+        level = np.asarray(_sums(rest) / np.sqrt(some), dtype=np.float64)
         contrast = np.asarray(_sums(rest * centred), dtype=np.float64) / length
         inside = _sums(rest * rest).sum(axis=1) - (level * level + contrast * contrast).sum(axis=1)
-        noise = np.maximum(inside, 0.0) / (patches * (size - 2)) / np.minimum(apart_px, 1.0) ** 2 + TINY
+        free = np.maximum(np.maximum(number - 2.0, 0.0).sum(axis=1), 1.0)
+        noise = np.maximum(inside, 0.0) / free / np.minimum(apart_px, 1.0) ** 2 + TINY
         noise = noise[:, None]
-        of_level = _beyond(level, noise, np.ones_like(strength))
+        of_level = _beyond(level, noise, number) * number
         of_contrast = _beyond(contrast, noise, strength) * strength
         of_level, of_contrast = of_level / (noise + of_level), of_contrast / (noise + of_contrast)
         differing = np.empty((*rest.shape, 2), dtype=np.float32)
-        differing[..., 0] = np.sqrt(of_level / size)[..., None]
+        np.multiply(known, np.sqrt(of_level / some).astype(np.float32)[..., None], out=differing[..., 0])
         np.multiply(centred, (np.sqrt(of_contrast) / length).astype(np.float32)[..., None], out=differing[..., 1])
         return Unevenness(differing, (of_contrast * contrast / length).astype(np.float32))
 
@@ -104,6 +108,8 @@ class PatternResiduals(Stacked):
     spread: FloatArray
     #: (Q, P) gray levels, no background in them
     samples: Float32Array
+    #: (Q, P) which of them are known: the others, and derivatives there, are 0
+    known: BoolArray
     #: (Q, P) these without the pattern, and times their inverse covariance, for noise with a variance of 1
     rest: Float32Array
     weighted: Float32Array
@@ -124,7 +130,7 @@ class PatternResiduals(Stacked):
 
     def sample_at(self, view: PatternView, quads: FloatArray, which: IntArray) -> None:
         """Move ``which`` (W,) to corners ``quads`` (W, 4, 2) so near that the patterns on them stay."""
-        samples = _samples(view.only(which), quads, self.grid)
+        samples = _samples(view.only(which), quads, self.grid) * self.known[which]
         uneven = self.unevenness and self.unevenness.only(which)
         terms, products = self.J[which, LINEAR], self.information[which, LINEAR, LINEAR]
         self.corners_px[which], self.samples[which] = quads, samples
@@ -138,7 +144,12 @@ class PatternResiduals(Stacked):
     @property
     def pixels(self) -> FloatArray:
         """Pixels (Q,) that the samples cover."""
-        return np.asarray(self.samples.shape[1] * self.grid.apart_px(self.to_cells) ** 2)
+        return np.asarray(self.number * self.grid.apart_px(self.to_cells) ** 2)
+
+    @property
+    def number(self) -> IntArray:
+        """Number (Q,) of samples that are known, at least 1."""
+        return np.asarray(np.maximum(self.known.sum(axis=1), 1))
 
 
 def linearised(
@@ -151,16 +162,19 @@ def linearised(
     """The fit of ``white`` cells (Q, m, m), seen with ``blur`` (Q,) [px], at corners ``quads`` (Q, 4, 2)."""
     to_cells = cells_by_pixels(quads, white.shape[1])
     model, spread = blurred(view, to_cells, blur, white, grid)
-    samples = _samples(view, quads, grid)
+    known = view.known(quads, grid)
+    samples = _samples(view, quads, grid) * known
     parts = linear_terms(model, spread, grid, white.shape[1], displayed=view.displayed)
     J = np.empty((len(quads), LINEAR.start + sum(part.shape[1] for part in parts), samples.shape[1]), dtype=np.float32)
     terms = np.concatenate(parts, axis=1, out=J[:, LINEAR])
+    blank(terms, known)
     products = products_of(terms)
     amounts, rest, weighted = fitted(terms, products, samples, None)
     contrast = local_contrast(amounts.astype(np.float32), model, grid, displayed=view.displayed)
     uneven = None
     if view.displayed:
-        uneven = Unevenness.shown(grid.patches(model.value), grid.patches(rest), grid.apart_px(to_cells))
+        pattern, left, counting = (grid.patches(values) for values in (model.value, rest, known.astype(np.float32)))
+        uneven = Unevenness.shown(pattern, left, counting, grid.apart_px(to_cells))
         contrast = (grid.patches(contrast) + uneven.more_contrast[..., None]).reshape(rest.shape)
         whole, sign = np.abs(amounts[:, :1]), np.sign(amounts[:, :1])
         contrast = (sign * np.maximum(sign * contrast, _LEAST_CONTRAST * whole)).astype(np.float32)
@@ -171,6 +185,7 @@ def linearised(
     np.multiply(contrast, model.wider, out=J[:, BLUR])
     if not grid.graded:
         J[:, : LINEAR.start] = grid.without_background(J[:, : LINEAR.start])
+    blank(J[:, : LINEAR.start], known)
     information = np.empty((len(J), J.shape[1], J.shape[1]))
     information[:, LINEAR, LINEAR] = products
     information[:, : LINEAR.start] = J[:, : LINEAR.start] @ J.swapaxes(1, 2)
@@ -179,7 +194,7 @@ def linearised(
         information -= uneven.information(J)
         amounts, rest, weighted = fitted(terms, information[:, LINEAR, LINEAR], samples, uneven)
     return PatternResiduals(
-        quads, blur, to_cells, spread, samples, rest, weighted, amounts, J, information, grid, uneven
+        quads, blur, to_cells, spread, samples, known, rest, weighted, amounts, J, information, grid, uneven
     )
 
 
@@ -188,6 +203,12 @@ def _samples(view: PatternView, quads: FloatArray, grid: PatternGrid) -> Float32
     values = view.values(quads, grid)
     # Small numbers for sums in single precision.
     return grid.without_background(values - values[:, :1])
+
+
+def blank(rows: Float32Array, known: BoolArray) -> None:
+    """Set rows (Q, K, P) to 0 at samples that are not ``known`` (Q, P)."""
+    if not known.all():
+        rows *= known[:, None]
 
 
 def products_of(rows: Float32Array) -> FloatArray:

@@ -9,7 +9,8 @@ Corners are those of the fitted sides (:mod:`side_fit`), or of the whole pattern
 and in pictures for a display (:mod:`pattern_fit`). A gain control for displays is a nonlinear function of the counts:
 all dark regions grow, or all shrink, and only the whole pattern shows by how much. Before lag tails are removed, it is
 undone as far as it is known (:mod:`gray_scale`); the markers then show it better, and if that changes it much, the
-refinement is repeated as well.
+refinement is repeated as well. Pixels that are as black or as white as it goes have no counts, only bounds of these
+(:class:`prediction.frame.Saturation`).
 """
 
 from dataclasses import dataclass, replace
@@ -119,7 +120,8 @@ def _shown_scale(
     config: ArucoDetectorConfig,
 ) -> GrayScale:
     """The gray scale of the display that markers show, which were looked for at ``start`` (N, 4)."""
-    view = PatternView(frame.image, lag=markers.blur.lag, bends=lens_bends(start, frame.camera))
+    bends = lens_bends(start, frame.camera)
+    view = PatternView(frame.image, lag=markers.blur.lag, bends=bends, saturation=frame.saturation())
     corners = markers.observed.corners_px + markers.blur.removed
     return before.shown_by(view, corners, markers.ids, decoder, config.blur_px)
 
@@ -166,11 +168,20 @@ def _by_patterns(
     # Each group is sampled alike.
     near = nearness(start.px, decoder.cells, np.hypot(config.blur_px, np.hypot(*blur.spread.T)))
     refined = RefinedCorners.none()
+    # At rest the model of a bent gray scale contains its ends.
+    saturation = None if blur.to_tails is None else frame.saturation()
     for nearer in np.unique(near):
         which = near == nearer
         there, moving = start.only(which), blur.only(which)
         bends = lens_bends(there, frame.camera)
-        view = PatternView(frame.image, moving.to_tails, moving.spread, displayed=frame.displayed, bends=bends)
+        view = PatternView(
+            frame.image,
+            moving.to_tails,
+            moving.spread,
+            displayed=frame.displayed,
+            bends=bends,
+            saturation=saturation,
+        )
         fitted = fitted_patterns(frame, found.only(which), there, view, nearer, decoder, config.blur_px)
         refined = refined.joined(fitted)
     return refined.only(_places(near))

@@ -18,6 +18,7 @@ of tau + m / 2 ago.
 
 from dataclasses import dataclass, replace
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,7 +27,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.prediction.twist import interaction, Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.pixel_noise import pixel_noise, with_columns_corrected
-from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
 
 #: Least depth of points, used for those behind the camera [m].
 LEAST_DEPTH = 1e-3
@@ -94,6 +95,14 @@ class Frame:
             image = with_columns_corrected(image, noise)
         return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed, counts, corrected)
 
+    def saturation(self) -> 'Saturation | None':
+        """Where the gray scale of a picture for a display ends; None: raw counts."""
+        if not self.displayed or self.received is None:
+            return None
+        black, white = self.received == 0, self.received == _LEVELS - 1
+        low, high = self.image[black].max(initial=-np.inf), self.image[white].min(initial=np.inf)
+        return Saturation(np.subtract(white, black, dtype=np.float32), float(low), float(high))
+
     def in_counts(self, counts_of_levels: FloatArray) -> 'Frame':
         """The frame with counts for the gray levels of a picture for a display, by those (256,) of each level.
 
@@ -105,6 +114,36 @@ class Frame:
         if self.corrected:
             image = with_columns_corrected(image, noise)
         return replace(self, image=image, noise=noise)
+
+
+class Saturation(NamedTuple):
+    """Pixels that are as white or as black as a display shows: what they show is a bound of their counts."""
+
+    #: (height, width) 1 for white, -1 for black, else 0
+    sign: Float32Array
+    #: counts of black and of white
+    low: float
+    high: float
+
+    def at(self, places: Float32Array) -> Float32Array:
+        """Signs (...) at places (2, ...) in the image, 0 where no neighbour is saturated."""
+        u, v = places
+        signs = cv2.remap(self.sign, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(signs, dtype=np.float32)
+
+    def cut(self, counts: Float32Array) -> Float32Array:
+        """``counts`` (...) that are no blacker than black, and no whiter than white."""
+        return np.asarray(np.clip(counts, self.low, self.high), dtype=np.float32)
+
+    def known(self, places: Float32Array, tails: Float32Array) -> BoolArray:
+        """Which places (2, ...) are known without their lag tails at ``tails`` (2, ...), within ``low`` and ``high``.
+
+        Where the tail is not saturated, a pixel that is stays so without it. Where both are, what made the pixel
+        white may have left it just now; it will then have faded to less than a half in the time of a lag tail, which
+        the place on the other side shows.
+        """
+        now, then, later = self.at(places), self.at(tails), self.at(2.0 * places - tails)
+        return np.asarray((then == 0.0) | (now * then < 0.0) | ((now * then > 0.0) & (now * later > 0.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,6 +241,12 @@ def counts_of(pixel: IntArray, image: Float32Array, to_tails: FloatArray | None 
 def without_tails(counts: Float32Array, lag_tails: Float32Array) -> Float32Array:
     """``counts`` (...) at some places without the lag tails there, where ``lag_tails`` (...) are the image's."""
     return np.asarray(counts + np.float32(_GAIN - 1.0) * (counts - lag_tails))
+
+
+def lag_tails(places: Float32Array, to_tails: FloatArray) -> Float32Array:
+    """Lag tails (2, N, P) of ``places`` (2, N, P) of N markers, by maps (N, 2, 3) of :func:`lag_tail_maps`."""
+    maps = to_tails.transpose(1, 2, 0)[..., None].astype(np.float32)
+    return np.asarray(maps[:, 0] * places[0] + maps[:, 1] * places[1] + maps[:, 2])
 
 
 def lag_tail_maps(corners_px: FloatArray, lag_blur_px: FloatArray) -> FloatArray:
