@@ -6,6 +6,7 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.detection.confirmation import confirmed
+from thermal_fiducial.core.detection.corners.gray_scale import GrayScale
 from thermal_fiducial.core.detection.corners.refining import refine
 from thermal_fiducial.core.detection.finding.finder import FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.partial.partial_markers import PartialMarkerSearch
@@ -101,7 +102,7 @@ class MarkerDetector:
             poses = self._poses(ids, corners.covariances, at, T_camera_map)
         rows = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
         if T_camera_map is not None and expected is not None and among(ids, known.ids).sum() < _ENOUGH_WHOLE:
-            rows = self._with_partial(rows, frame, T_camera_map, prediction.position_std_m)
+            rows = self._with_partial(rows, frame, scale, T_camera_map, prediction.position_std_m)
         # A twist by corners of which none was confirmed as a marker's is dropped.
         twist = refined.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], known.sizes[ids])
@@ -117,11 +118,13 @@ class MarkerDetector:
         poses = planar_poses(at, covariances, sizes)
         return choose_branches(poses, at, covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
 
-    def _with_partial(self, rows: Markers, frame: Frame, T_camera_map: FloatArray, position_std_m: float) -> Markers:
+    def _with_partial(
+        self, rows: Markers, frame: Frame, scale: GrayScale, T_camera_map: FloatArray, position_std_m: float
+    ) -> Markers:
         """The rows of whole markers, and those of known ones that are partially visible."""
         found_ids = rows['id'].astype(np.int64)
         candidates = self._known.partially_visible(T_camera_map, frame.camera, found_ids)
-        ids, corners = self._partial.look(frame, candidates, position_std_m, self.config)
+        ids, corners = self._partial.look(frame, scale, candidates, position_std_m, self.config)
         if len(ids) == 0:
             return rows
         at = ImagePoints.at(corners.corners_px, frame.camera)

@@ -33,16 +33,18 @@ from thermal_fiducial.core.detection.plates import outlines_on_faces
 from thermal_fiducial.core.detection.prediction.frame import (
     counts_of,
     Frame,
+    lag_tails,
     LEAST_DEPTH,
     motion_blur,
     Places,
     removed_displacement,
     rolling_displacement,
+    Saturation,
 )
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import retract
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, Stacked, TINY
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
 
 # Columns of pixels across an edge.
 _COLUMNS = 6
@@ -100,6 +102,17 @@ class Layer:
     lag_blur: FloatArray
     #: (1, 2, 3) map from pixels to their lag tails, which are removed; None: none are
     to_tails: FloatArray | None = None
+    #: where the gray scale of a display ends; None: nowhere, or no lag tails are removed
+    saturation: Saturation | None = None
+
+    def without_saturated(self, pixel: IntArray, counting: BoolArray) -> BoolArray:
+        """Which pixels ``counting`` (...), with indices ``pixel`` in the image, have counts, lag tails included."""
+        if self.saturation is None or self.to_tails is None:
+            return counting
+        v, u = np.divmod(pixel.reshape(1, -1), self.image.shape[1])
+        places = np.stack([u, v]).astype(np.float32)
+        saturated = np.abs(self.saturation.at(places)) + np.abs(self.saturation.at(lag_tails(places, self.to_tails)))
+        return np.asarray(counting & (saturated == 0.0).reshape(pixel.shape))
 
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (..., 2) of points (..., 3) in the camera frame, displaced by motion; NaN outside the lens model."""
@@ -140,11 +153,15 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer, thick
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, _COLUMNS, widest)
     blur = blur_of(sides, layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
+    counting = layer.without_saturated(sides.pixel, modelled.counting)
+    # An edge of which the ends of a gray scale hide more than half does not speak against the marker.
+    shown = 2 * counting.sum(axis=(0, 1, 3)) >= modelled.counting.sum(axis=(0, 1, 3))
+    modelled = modelled._replace(counting=counting)
     measured = measure(counts_of(sides.pixel, layer.image, layer.to_tails), modelled, REACHED * blur.across, len(nodes))
     used = measured.variance[0] < UNMEASURED
     if used.sum() < 6:
         return None
-    J = _design(T, size, pattern, sides, modelled.counting, layer.camera)
+    J = _design(T, size, pattern, sides, counting, layer.camera)
     sharpness = np.where(used, 1.0 / np.sqrt(measured.variance[0] + OF_SIDES_PX**2), 0.0)
     # So weak that it only keeps the system solvable.
     prior = TINY * np.diag((J[used] ** 2).sum(axis=0))
@@ -154,7 +171,7 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer, thick
         retract(T, step),
         fit.covariance[0],
         float(np.abs(J[used] @ step).max()),
-        len(used),
+        int(shown.sum()),
         int(fit.kept.sum()),
         float(np.median(measured.contrast[0][used])),
         math.sqrt(np.median(measured.noise[0][used])),
@@ -224,7 +241,8 @@ def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) 
             shift = shift - removed_displacement(places, frame.twist, frame)
         return np.asarray(shift[0] / factor)
 
-    return Layer(image, camera, displacement, blur, lag_blur, to_tails)
+    saturation = None if to_tails is None else frame.saturation()
+    return Layer(image, camera, displacement, blur, lag_blur, to_tails, saturation)
 
 
 def _coarser(camera: Camera, factor: int) -> Camera:

@@ -11,6 +11,7 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.corner_errors import OF_BENT_SCALE_PX, of_motion_blur, OF_SIDES_PX
+from thermal_fiducial.core.detection.corners.gray_scale import GrayScale
 from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.partial.grid import (
     adjusted,
@@ -80,6 +81,7 @@ class PartialMarkerSearch:
     def look(
         self,
         frame: Frame,
+        scale: GrayScale,
         candidates: PartialMarkers,
         unsure_m: float,
         config: ArucoDetectorConfig,
@@ -89,8 +91,11 @@ class PartialMarkerSearch:
         Parameters
         ----------
         frame : whose twist is known
+        scale : of the display, as far as whole markers have shown it; counts have none
         unsure_m : standard deviation of the predicted camera position [m]
         """
+        if frame.displayed:
+            frame = frame.in_counts(scale.counts)
         in_view = (
             self._expected(frame.camera, marker_id, size, T, unsure_m)
             for marker_id, T, size in zip(
