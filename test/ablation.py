@@ -186,7 +186,7 @@ MECHANISMS = {
         'slow, 0.5 K, blind', ('corners.squares',), {'corners.side_fit:as_squares': _as_seen}
     ),
     'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_INCONSISTENT': np.inf}),
-    'passes until settled': Mechanism('fast, 8 K, blind', (), {'corners.side_fit:PASSES': 1}),
+    'passes until settled': Mechanism('fast, 8 K, blind', (), {'corners.refining:PASSES': 1}),
     'second round': Mechanism('fast, 8 K, blind', (), {'corners.refining:_ROUNDS': 1}),
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
