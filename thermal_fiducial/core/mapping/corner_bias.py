@@ -1,5 +1,7 @@
 """Systematic errors of the corners (lens, detector), learned from residuals that last."""
 
+from dataclasses import dataclass
+from functools import cached_property
 import math
 from statistics import median
 from typing import NamedTuple
@@ -41,17 +43,15 @@ class CornerBias:
         # Sums over frames: their number, the weights of their markers, shapes, what is known of corners' own errors,
         # and what residuals show.
         self._sums = np.zeros(9)
-        #: the last frame, and the weights (N,) of its markers
-        self._last: tuple[Location | None, FloatArray] = None, np.zeros(0)
+        #: the last frame, and its corners
+        self._last: tuple[Location, _FittedCorners] | None = None
 
     def add(self, location: Location) -> None:
         """Update with the residuals of a located frame."""
-        (last, before), noise = self._last, location.sight.noise_px
-        # Markers with more noise than the frame's median have less weight.
-        shares = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2)
-        self._last = location, shares
-        if last is None or location.pose.stamp_ns <= last.pose.stamp_ns:
+        before, self._last = self._last, (location, _FittedCorners.of(location))
+        if before is None or location.pose.stamp_ns <= before[0].pose.stamp_ns:
             return
+        last, noise = before[0], location.sight.noise_px
         places = {key: place for place, key in enumerate(last.pose.marker_ids)}
         now = [place for place, key in enumerate(location.pose.marker_ids) if key in places]
         then = [places[location.pose.marker_ids[place]] for place in now]
@@ -61,13 +61,12 @@ class CornerBias:
         products = (residuals * former).sum(axis=(1, 2)) / 8.0
         of_shape = products - (residuals.mean(axis=1) * former.mean(axis=1)).sum(axis=1) / 2.0
         of_shape = np.clip(of_shape / (noise[now] * last.sight.noise_px[then]), -LARGEST_SHAPE, LARGEST_SHAPE)
-        shares = shares[now] * before[then]
+        fitted, former_fitted = self._last[1].only(now), before[1].only(then)
+        shares = fitted.shares * former_fitted.shares
         # Residuals of moved or mistaken markers are correlated too.
         limit = min(INCONSISTENT_PX, BIAS_OUTLIER * self.px) ** 2
         bound = np.minimum(1.0, limit / np.maximum(np.abs(products), TINY))
-        shown, common = shown_errors(
-            *(_FittedCorners.of(of, chosen, shares, bound) for of, chosen in ((location, now), (last, then)))
-        )
+        shown, common = shown_errors(fitted, former_fitted, np.repeat(np.sqrt(bound), 8))
         known = shown.own * float(shares @ location.sight.observed.detector_px[now] ** 2) / len(now)
         sums = common * np.array((shares.mean(), known, *shown))
         self._sums = BIAS_MEMORY * self._sums + (1.0, of_shape.mean() / SHAPE_VISIBLE, *sums)
@@ -111,47 +110,86 @@ class ShownErrors(NamedTuple):
         return (self.product - min(max(own, 0.0) * self.own, known)) / self.smooth
 
 
-class _FittedCorners(NamedTuple):
-    """Weighted corners of a frame, two coordinates each, with the smooth error before and after a fit of the pose."""
+@dataclass(frozen=True)
+class _FittedCorners:
+    """Weighted corners of the markers of a frame: what the smooth error is at them, and what the pose takes up."""
 
-    #: (2 n,) [px]
+    #: (N,) weights of the markers: those with more noise than the frame's median have less
+    shares: FloatArray
+    #: (N, 4, 2) [px], their derivatives (N, 8, 6) by the pose, and (N, 4, I) by the factors of the smooth error
     residuals: FloatArray
-    #: (2 n, 6) orthonormal directions, along which the pose takes up errors
-    taken_up: FloatArray
-    #: (2 n, 2 I) derivatives of the errors by the factors of the smooth one, before the fit and after it
-    smooth: FloatArray
-    left: FloatArray
+    J: FloatArray
+    modes_of_markers: FloatArray
 
     @classmethod
-    def of(cls, location: Location, chosen: list[int], shares: FloatArray, bound: FloatArray) -> '_FittedCorners':
-        """The ``chosen`` (m,) markers of a frame, with weights (m,), and further ones (m,) of their residuals."""
-        weights, scale = (np.repeat(np.sqrt(values), 8) for values in (shares, shares * bound))
-        J = location.reprojection.J_camera[chosen].reshape(-1, 6)
-        taken_up = np.linalg.qr(weights[:, None] * J)[0]
-        modes = location.lens.modes[chosen].reshape(len(J) // 2, -1)
-        smooth = np.zeros((len(modes), 2, modes.shape[1], 2))
-        smooth[:, 0, :, 0] = smooth[:, 1, :, 1] = modes
-        smooth = weights[:, None] * smooth.reshape(len(J), -1)
-        residuals = scale * location.reprojection.residuals[chosen].ravel()
-        return cls(residuals, taken_up, smooth, smooth - taken_up @ (taken_up.T @ smooth))
+    def of(cls, location: Location) -> '_FittedCorners':
+        """All markers of a frame."""
+        noise, fit = location.sight.noise_px, location.reprojection
+        shares = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2)
+        weights = shares[:, None, None]
+        return cls(shares, weights * fit.residuals, weights * fit.J_camera, weights * location.lens.modes)
+
+    def only(self, chosen: list[int]) -> '_FittedCorners':
+        """The markers at the places ``chosen``."""
+        if chosen == list(range(len(self.shares))):
+            return self
+        fields = self.shares, self.residuals, self.J, self.modes_of_markers
+        return _FittedCorners(*(field[chosen] for field in fields))
+
+    @cached_property
+    def modes(self) -> FloatArray:
+        """(n, I) of either coordinate of all corners."""
+        return self.modes_of_markers.reshape(-1, self.modes_of_markers.shape[-1])
+
+    @cached_property
+    def taken_up(self) -> FloatArray:
+        """(2 n, 6) orthonormal directions, along which the pose takes up errors."""
+        return np.linalg.qr(self.J.reshape(-1, 6))[0]
+
+    @cached_property
+    def smooth_taken_up(self) -> FloatArray:
+        """(2 I, 6) of the smooth error, by its factors."""
+        return self.by_factors(self.taken_up)
+
+    @cached_property
+    def gram(self) -> FloatArray:
+        """(I, I) of ``modes``."""
+        return np.asarray(self.modes.T @ self.modes)
+
+    def by_factors(self, corners: FloatArray) -> FloatArray:
+        """(2 I, k) sums of (2 n, k) over the corners, by the factors of the smooth error."""
+        return np.asarray((self.modes.T @ corners.reshape(len(self.modes), -1)).reshape(-1, corners.shape[-1]))
 
 
-def shown_errors(now: _FittedCorners, former: _FittedCorners) -> tuple[ShownErrors, float]:
+def shown_errors(now: _FittedCorners, former: _FittedCorners, bound: FloatArray) -> tuple[ShownErrors, float]:
     """What the residuals of n corners and the ``former`` ones of the same corners show.
+
+    Parameters
+    ----------
+    bound : (2 n,) weights of the residuals of both
 
     Returns
     -------
     that, and the share, 0 to 1, of the smooth error in the present residuals that was in the former ones
     """
-    n = len(now.residuals) // 2
-    both = np.vdot(now.left.T @ now.left, former.left.T @ former.left)
-    smooth = float(np.vdot(now.left, former.left))
+    n = len(now.modes)
+    r_now, r_former = ((bound * of.residuals.ravel())[:, None] for of in (now, former))
+    common = now.taken_up.T @ former.taken_up
+    up_now, up_former = now.smooth_taken_up, former.smooth_taken_up
+    both_up = up_now.T @ up_former
+    smooth = 2.0 * np.vdot(now.modes, former.modes) + np.vdot(common, both_up)
+    smooth -= np.vdot(up_now, former.by_factors(now.taken_up)) + np.vdot(up_former, now.by_factors(former.taken_up))
+    both = 2.0 * np.vdot(now.gram, former.gram) + np.vdot(both_up, both_up)
+    for gram, up in ((now.gram, up_former), (former.gram, up_now)):
+        of_coordinates = up.reshape(len(gram), -1)
+        both -= np.vdot(of_coordinates, gram @ of_coordinates)
     sums = (
-        np.vdot(now.residuals, former.residuals),
-        np.vdot(now.residuals @ now.smooth, former.residuals @ former.smooth),
-        2.0 * n - 12.0 + np.square(now.taken_up.T @ former.taken_up).sum(),
+        np.vdot(r_now, r_former),
+        np.vdot(now.by_factors(r_now), former.by_factors(r_former)),
+        2.0 * n - 12.0 + np.vdot(common, common),
         smooth,
         both,
     )
-    common = smooth / max(float(np.vdot(now.left, now.left)), TINY)
-    return ShownErrors(*(float(value) / (2.0 * n) for value in sums)), min(max(common, 0.0), 1.0)
+    alone = 2.0 * now.gram.trace() - np.vdot(up_now, up_now)
+    share = float(smooth) / max(float(alone), TINY)
+    return ShownErrors(*(float(value) / (2.0 * n) for value in sums)), min(max(share, 0.0), 1.0)
