@@ -285,6 +285,11 @@ sys.exit(run.run(Stage))"""
 HOLDS_THE_INTERPRETER = "re.match('(a+)+$', 64 * 'a' + 'b')"
 
 
+def said(done):
+    """Lines that a program has printed, without those of Fast DDS about ports that a killed process has left locked."""
+    return [line for line in done.stdout.splitlines() if 'RTPS_TRANSPORT_SHM' not in line]
+
+
 @pytest.mark.parametrize(
     ('at_work', 'while_destroyed', 'while_python_ends', 'limit', 'status'),
     [
@@ -301,7 +306,7 @@ def test_a_node_stops_silently(at_work, while_destroyed, while_python_ends, limi
     """
     program = ENDED % (at_work, while_destroyed, while_python_ends, limit)
     done = finished(program)
-    assert (done.returncode, done.stdout, done.stderr) == (status, 'finished\nsaved\n', '')
+    assert (done.returncode, said(done), done.stderr) == (status, ['finished', 'saved'], '')
 
 
 @pytest.mark.parametrize('ending', [CRASHES, IS_DEAF])
@@ -309,4 +314,4 @@ def test_a_node_that_crashes_or_is_deaf_and_does_not_end_is_no_stopped_one(endin
     """It is to be started again: SIGPROF would say that it was asked to stop."""
     program = ENDED.replace('sys.exit(run.run(Stage))', ending) % ('pass', HOLDS_THE_INTERPRETER, 'pass', SHORT)
     done = finished(program)
-    assert (done.returncode, done.stdout) == (-signal.SIGALRM, 'saved\n')
+    assert (done.returncode, said(done)) == (-signal.SIGALRM, ['saved'])
