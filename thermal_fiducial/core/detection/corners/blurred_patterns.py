@@ -21,7 +21,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.prediction.frame import lag_tails, Saturation, without_tails
+from thermal_fiducial.core.detection.prediction.frame import lag_tail_places, Saturation, without_tails
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY
@@ -171,19 +171,19 @@ class PatternView(NamedTuple):
         places = self._places(quads, grid)
         shown = self._at(places)
         if self.to_tails is not None:
-            shown = without_tails(shown, self._at(lag_tails(places, self.to_tails)))
+            shown = without_tails(shown, self._at(lag_tail_places(places, self.to_tails)))
             if self.saturation is not None:
                 shown = self.saturation.cut(shown)
         return shown
 
     def known(self, quads: FloatArray, grid: PatternGrid) -> BoolArray:
         """Which samples (Q, P) of markers in ``quads`` (Q, 4, 2) are known."""
-        places = self._places(quads, grid)
         if self.saturation is None:
-            return np.ones(places.shape[1:], dtype=np.bool_)
+            return np.ones((len(quads), grid.weights.shape[1]), dtype=np.bool_)
+        places = self._places(quads, grid)
         if self.to_tails is None:
             return np.asarray(self.saturation.at(places) == 0.0)
-        return self.saturation.known(places, lag_tails(places, self.to_tails))
+        return self.saturation.known(places, lag_tail_places(places, self.to_tails))
 
     def _places(self, quads: FloatArray, grid: PatternGrid) -> Float32Array:
         places = seen_between(quads, grid.weights)

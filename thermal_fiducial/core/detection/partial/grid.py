@@ -33,7 +33,7 @@ from thermal_fiducial.core.detection.plates import outlines_on_faces
 from thermal_fiducial.core.detection.prediction.frame import (
     counts_of,
     Frame,
-    lag_tails,
+    lag_tail_places,
     LEAST_DEPTH,
     motion_blur,
     Places,
@@ -111,8 +111,9 @@ class Layer:
             return counting
         v, u = np.divmod(pixel.reshape(1, -1), self.image.shape[1])
         places = np.stack([u, v]).astype(np.float32)
-        saturated = np.abs(self.saturation.at(places)) + np.abs(self.saturation.at(lag_tails(places, self.to_tails)))
-        return np.asarray(counting & (saturated == 0.0).reshape(pixel.shape))
+        both = places, lag_tail_places(places, self.to_tails)
+        hidden = np.logical_or(*(self.saturation.at(of) != 0.0 for of in both))
+        return np.asarray(counting & ~hidden.reshape(pixel.shape))
 
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (..., 2) of points (..., 3) in the camera frame, displaced by motion; NaN outside the lens model."""

@@ -96,10 +96,12 @@ class Frame:
         return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed, counts, corrected)
 
     def saturation(self) -> 'Saturation | None':
-        """Where the gray scale of a picture for a display ends; None: raw counts."""
+        """Where the gray scale of a picture for a display ends; None: nowhere, or raw counts."""
         if not self.displayed or self.received is None:
             return None
         black, white = self.received == 0, self.received == _LEVELS - 1
+        if not (black.any() or white.any()):
+            return None
         low, high = self.image[black].max(initial=-np.inf), self.image[white].min(initial=np.inf)
         return Saturation(np.subtract(white, black, dtype=np.float32), float(low), float(high))
 
@@ -243,8 +245,8 @@ def without_tails(counts: Float32Array, lag_tails: Float32Array) -> Float32Array
     return np.asarray(counts + np.float32(_GAIN - 1.0) * (counts - lag_tails))
 
 
-def lag_tails(places: Float32Array, to_tails: FloatArray) -> Float32Array:
-    """Lag tails (2, N, P) of ``places`` (2, N, P) of N markers, by maps (N, 2, 3) of :func:`lag_tail_maps`."""
+def lag_tail_places(places: Float32Array, to_tails: FloatArray) -> Float32Array:
+    """Places (2, N, P) of the lag tails of ``places`` (2, N, P), by maps (N, 2, 3) of :func:`lag_tail_maps`."""
     maps = to_tails.transpose(1, 2, 0)[..., None].astype(np.float32)
     return np.asarray(maps[:, 0] * places[0] + maps[:, 1] * places[1] + maps[:, 2])
 
