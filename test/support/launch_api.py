@@ -65,6 +65,14 @@ class TimerAction:
     actions: list
 
 
+class PushLaunchConfigurations:
+    pass
+
+
+class PopLaunchConfigurations:
+    pass
+
+
 @dataclass(kw_only=True)
 class Node:
     """``launch_ros.actions.Node`` with those keywords of ``ExecuteProcess`` that are in use."""
@@ -123,7 +131,15 @@ def installed(monkeypatch, share, also=()):
         'launch.launch_context': {'LaunchContext': LaunchContext},
         'launch.launch_description': {'LaunchDescription': LaunchDescription},
         'launch.actions': {
-            kind.__name__: kind for kind in (DeclareLaunchArgument, OpaqueFunction, LogInfo, TimerAction)
+            kind.__name__: kind
+            for kind in (
+                DeclareLaunchArgument,
+                OpaqueFunction,
+                LogInfo,
+                TimerAction,
+                PushLaunchConfigurations,
+                PopLaunchConfigurations,
+            )
         },
         'launch.substitutions': {'LaunchConfiguration': LaunchConfiguration},
         'launch_ros': {},
@@ -157,6 +173,21 @@ def started(description, context):
     return opaque.function(context)
 
 
+def started_in_turn(actions, context):
+    """Nodes of actions, each while ``context`` is as when launch would start it; it is left as it was."""
+    stack = []
+    for action in actions:
+        if isinstance(action, PushLaunchConfigurations):
+            stack.append(dict(context.launch_configurations))
+        elif isinstance(action, PopLaunchConfigurations):
+            context.launch_configurations = stack.pop()
+        elif isinstance(action, OpaqueFunction):
+            assert action.function(context) is None
+        else:
+            yield action
+    assert not stack
+
+
 class Launch:
     """Runs actions: a process for each node, and what its ``on_exit`` asks for."""
 
@@ -167,14 +198,17 @@ class Launch:
         #: messages of LogInfo
         self.said = []
         self._threads = []
-        for action in actions:
+        self._do_all(actions)
+
+    def _do_all(self, actions):
+        for action in started_in_turn(actions, self.context):
             self._do(action)
 
     def _do(self, action):
         if isinstance(action, LogInfo):
             self.said.append(action.msg)
         elif isinstance(action, TimerAction):
-            threading.Timer(action.period, lambda: [self._do(item) for item in action.actions]).start()
+            threading.Timer(action.period, self._do_all, [action.actions]).start()
         elif not self.context.is_shutdown:
             self._start(action)
 
@@ -191,8 +225,7 @@ class Launch:
 
     def _wait(self, node, process):
         process.wait()
-        for action in node.on_exit(SimpleNamespace(returncode=process.returncode), self.context) or []:
-            self._do(action)
+        self._do_all(node.on_exit(SimpleNamespace(returncode=process.returncode), self.context) or [])
 
     def running(self, name):
         """The newest process of a node."""

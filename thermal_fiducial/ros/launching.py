@@ -8,7 +8,14 @@ import signal
 from typing import Any
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory, PackageNotFoundError
-from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, TimerAction
+from launch.actions import (
+    DeclareLaunchArgument,
+    LogInfo,
+    OpaqueFunction,
+    PopLaunchConfigurations,
+    PushLaunchConfigurations,
+    TimerAction,
+)
 from launch.launch_context import LaunchContext
 from launch.launch_description import LaunchDescription
 from launch.substitutions import LaunchConfiguration
@@ -96,21 +103,23 @@ def _actions(
         'parameters': [_params_file(given['params_file'], share), overrides],
         'remappings': [*remappings, *_topics(given)],
         'ros_arguments': ['--log-level', _log_level(given['log_level']), *_enclave(given['enclave'])],
-        'additional_env': {_DISCOVERY: _discovery_range(given['discovery_range'])},
+        # With what a group has set, for restarts after its end.
+        'additional_env': {**os.environ, _DISCOVERY: _discovery_range(given['discovery_range'])},
         'output': 'screen',
     }
     if given['landing_pad']:
         overrides['landing_pad'] = _ids(given['landing_pad'])
     names = ['thermal_source', *NODES] if given['camera'] else list(NODES)
     names += ['landing_target'] if given['landing_pad'] else []
-    actions += [_node(name, settings) for name in names]
-    actions += _second_camera(given, settings, _namespace(context, given['namespace']))
+    scope = dict(context.launch_configurations)
+    actions += [_node(name, settings, scope) for name in names]
+    actions += _second_camera(given, settings, scope)
     if _is_true('rviz', given):
         actions.append(_rviz(given['namespace'], share))
     return actions
 
 
-def _node(name: str, settings: dict[str, Any]) -> Node:
+def _node(name: str, settings: dict[str, Any], scope: dict[str, Any]) -> Node:
     def after(event: Any, context: LaunchContext) -> list[Any]:
         """Restart after a crash, but not after refused parameters, which would be refused again."""
         if context.is_shutdown or event.returncode in _STOPPED:
@@ -118,31 +127,44 @@ def _node(name: str, settings: dict[str, Any]) -> Node:
         if event.returncode == _REFUSED:
             return [LogInfo(msg=f'{name}: unusable parameters or arguments (see above); it is not started again')]
         message = LogInfo(msg=f'{name}: ended with status {event.returncode}; it is started again')
-        return [message, TimerAction(period=_RESPAWN_DELAY, actions=[_node(name, settings)])]
+        return [message, TimerAction(period=_RESPAWN_DELAY, actions=_within(scope, _node(name, settings, scope)))]
 
     return Node(executable=name, name=name, on_exit=after, **settings)
 
 
-def _namespace(context: LaunchContext, own: str) -> str:
+def _within(scope: dict[str, Any], node: Node) -> list[Any]:
+    """Actions that start a node in the ``scope`` of its first start: the group that set it has long been left.
+
+    Parameters
+    ----------
+    scope : launch configurations, where PushRosNamespace, SetRemap and SetParameter keep what they set, too
+    """
+
+    def enter(context: LaunchContext) -> None:
+        context.launch_configurations.update(scope)
+
+    return [PushLaunchConfigurations(), OpaqueFunction(function=enter), node, PopLaunchConfigurations()]
+
+
+def _namespace(own: str, scope: dict[str, Any]) -> str:
     """Absolute namespace of the nodes: behind that of PushRosNamespace, unless ``own`` is absolute itself."""
-    pushed = context.launch_configurations.get('ros_namespace', '')
-    joined = own if own.startswith('/') else f'{pushed}/{own}'
+    joined = own if own.startswith('/') else f'{scope.get("ros_namespace", "")}/{own}'
     return '/' + joined.strip('/')
 
 
-def _second_camera(given: dict[str, str], settings: dict[str, Any], namespace: str) -> list[Node]:
-    """Front end and detector of a second camera; map and odometry are those of the others, in ``namespace``."""
+def _second_camera(given: dict[str, str], settings: dict[str, Any], scope: dict[str, Any]) -> list[Node]:
+    """Front end and detector of a second camera; map and odometry are those of the others."""
     name, device = given['second_camera'], given['second_camera_device']
     if not name:
         if device:
             raise InputError('second_camera_device: no effect without second_camera')
         return []
-    own = namespace.rstrip('/')
+    own = _namespace(given['namespace'], scope).rstrip('/')
     shared = [(topic, f'{own}/{topic}') for topic in SHARED_WITH_SECOND_CAMERA]
     parameters = [*settings['parameters'], *([{'camera': device}] if device else [])]
     changes = {'namespace': f'{own}/{name}', 'remappings': shared, 'parameters': parameters}
     nodes = ['thermal_source', *OF_CAMERA] if device else OF_CAMERA
-    return [_node(node, settings | changes) for node in nodes]
+    return [_node(node, settings | changes, scope) for node in nodes]
 
 
 def _unknown_arguments(context: LaunchContext) -> list[Any]:

@@ -97,7 +97,7 @@ def test_arguments_reach_the_nodes(launched, tmp_path):
 def test_nodes_are_visible_only_on_this_computer_by_default(launched, monkeypatch, asked, environment, expected):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', environment)
     _, nodes = launched('mapping.launch.py', discovery_range=asked, enclave='/drone')
-    assert [node.additional_env for node in nodes] == [{'ROS_AUTOMATIC_DISCOVERY_RANGE': expected}] * 4
+    assert [node.additional_env['ROS_AUTOMATIC_DISCOVERY_RANGE'] for node in nodes] == [expected] * 4
     assert all(node.ros_arguments[2:] == ['--enclave', '/drone'] for node in nodes)
 
 
@@ -202,7 +202,7 @@ def test_a_crash_is_followed_by_another_start_and_refused_parameters_are_not(lau
     for status in (1, -11, -signal.SIGALRM, 134):
         log, timer = ekf.on_exit(SimpleNamespace(returncode=status), context)
         assert f'status {status}' in log.msg
-        (again,) = timer.actions
+        (again,) = launch_api.started_in_turn(timer.actions, context)
         assert (again.executable, again.parameters) == (ekf.executable, ekf.parameters)
         assert len(again.on_exit(SimpleNamespace(returncode=status), context)) == 2
     (log,) = ekf.on_exit(SimpleNamespace(returncode=2), context)
@@ -211,6 +211,25 @@ def test_a_crash_is_followed_by_another_start_and_refused_parameters_are_not(lau
         assert ekf.on_exit(SimpleNamespace(returncode=status), context) == []
     context.is_shutdown = True
     assert ekf.on_exit(SimpleNamespace(returncode=-9), context) == []
+
+
+def test_a_restart_after_a_crash_is_in_the_group_of_the_first_start(launched, monkeypatch):
+    """Of a launch file for many drones; launch leaves a group once its nodes are started, as its maintainers explain.
+
+    https://github.com/ros2/launch/issues/825
+    """
+    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
+    _, nodes = launched('localization.launch.py', pushed='fleet', second_camera='down')
+    monkeypatch.setenv('ROS_DOMAIN_ID', '0')
+    context = launch_api.LaunchContext()
+    namespaces = []
+    for node in nodes:
+        _, timer = node.on_exit(SimpleNamespace(returncode=-11), context)
+        for again in launch_api.started_in_turn(timer.actions, context):
+            namespaces.append(again.full_namespace(context))
+            assert again.additional_env['ROS_DOMAIN_ID'] == '7'
+    assert namespaces == ['/fleet'] * 4 + ['/fleet/down'] * 2
+    assert context.launch_configurations == {}
 
 
 @pytest.mark.parametrize(
