@@ -9,7 +9,8 @@ from dataclasses import dataclass, Field, field, fields, MISSING
 import difflib
 import math
 import os
-from typing import Any, TypeVar
+import re
+from typing import Any, get_args, TypeVar
 
 from thermal_fiducial.errors import InputError
 
@@ -156,7 +157,7 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
         Wrong type, out of range, not among the choices, or not a unit quaternion.
     """
     limits = item.metadata
-    result = _typed(name, item.default, limits['length'], value)
+    result = _typed(name, item, value)
     if limits['path']:
         result = from_home(result)
     if limits['choices'] and result not in limits['choices']:
@@ -190,18 +191,23 @@ def _shortened(text: str) -> str:
     return text if len(text) <= _LONGEST_SHOWN else f'{text[:_LONGEST_SHOWN]}...'
 
 
-def _typed(name: str, default: Any, length: int | None, value: Any) -> Any:
-    if isinstance(default, tuple):
-        if isinstance(value, str) or not hasattr(value, '__iter__'):
-            raise InputError(f'parameter {name}: {_shown(value)} is not a list')
-        elements = tuple(value)
-        if length is not None and len(elements) != length:
-            raise InputError(f'parameter {name}: {len(elements)} values, not {length}')
-        return elements if length is None else tuple(_number(name, element) for element in elements)
-    if isinstance(default, float):
+def _typed(name: str, item: 'Field[Any]', value: Any) -> Any:
+    if not isinstance(item.default, tuple):
+        return _of_kind(name, type(item.default), value)
+    if isinstance(value, str) or not hasattr(value, '__iter__'):
+        raise InputError(f'parameter {name}: {_shown(value)} is not a list')
+    elements, length = tuple(value), item.metadata['length']
+    if length is not None and len(elements) != length:
+        raise InputError(f'parameter {name}: {len(elements)} values, not {length}')
+    return tuple(_of_kind(name, get_args(item.type)[0], element) for element in elements)
+
+
+def _of_kind(name: str, kind: type, value: Any) -> Any:
+    if kind is float:
         return _number(name, value)
-    if not isinstance(value, type(default)) or (isinstance(value, bool) and not isinstance(default, bool)):
-        raise InputError(f'parameter {name}: {_shown(value)} is not of type {type(default).__name__}')
+    # In Python a bool is an int.
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise InputError(f'parameter {name}: {_shown(value)} is not of type {kind.__name__}')
     return value
 
 
@@ -231,6 +237,12 @@ def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
         if not 0.0 < sizes[int(marker_id)] < 100.0:
             raise InputError(f'parameter marker_size_overrides: {_shown(entry)} has no usable size')
     return sizes
+
+
+def _refuse_no_namespace(name: str) -> None:
+    """Raise InputError for what no ROS namespace can be; empty: none."""
+    if name and not re.fullmatch(r'[A-Za-z_]\w*(/[A-Za-z_]\w*)*', name, re.ASCII):
+        raise InputError(f'parameter second_camera: {_shown(name)} is not the name of a namespace')
 
 
 def unknown_markers(config: 'ArucoDetectorConfig', count: int) -> list[str]:
@@ -574,6 +586,7 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
         '',
         'Name of a second camera, whose poses are fused with those of the first or replace them: subscribes to '
         'NAME/markers and NAME/thermal/camera_info. Empty: none.',
+        verify=_refuse_no_namespace,
     )
     second_camera_position: tuple[float, ...] = _camera_position('the second camera', ('second_camera',))
     second_camera_orientation: tuple[float, ...] = _camera_orientation(

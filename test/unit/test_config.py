@@ -48,6 +48,7 @@ class Example(SelfChecked):
     place: tuple[float, ...] = param((0.0, 0.0), 'Place.', unit='m', length=2, minimum=-5.0)
     turn: tuple[float, ...] = param((0.0, 1.0), 'Turn.', length=2, normed=True)
     words: tuple[str, ...] = param((), 'Words.')
+    ids: tuple[int, ...] = param((), 'IDs.')
     inner: Inner = group(Inner)  # noqa: RUF009
 
 
@@ -173,6 +174,7 @@ def test_parameters_of_a_class_and_of_an_instance():
         'place',
         'turn',
         'words',
+        'ids',
         'inner.gain',
     ]
     changed = from_mapping(Example, {'inner.gain': 0.5})
@@ -203,6 +205,9 @@ def test_values_take_the_place_of_defaults_and_names_of_others_are_left_alone():
         ({'turn': [0.6, float('nan')]}, 'no unit quaternion'),
         ({'words': 'ab'}, "'ab' is not a list"),
         ({'words': 7}, '7 is not a list'),
+        ({'words': ['a', 7]}, '7 is not of type str'),
+        ({'ids': [7.5]}, '7.5 is not of type int'),
+        ({'ids': [True]}, 'True is not of type int'),
         ({'inner.gain': 2.1}, 'parameter inner.gain: 2.1 is outside 0.0 .. 2.0'),
         ({'inner.gain': float('nan')}, 'outside'),
         ({'inner.gain': False}, 'not a number'),
@@ -240,7 +245,12 @@ def test_what_does_not_fit_is_refused_by_name(values, words):
         (lambda: ImuNoise(accelerometer_random_walk=0.3), 'accelerometer_random_walk: 0.3 is outside'),
         (lambda: ImuNoise(vibration=-1.0), 'parameter vibration: -1.0 is outside'),
         (lambda: ArucoDetectorConfig(marker_size_overrides=('7',)), 'parameter marker_size_overrides'),
+        (lambda: ArucoDetectorConfig(marker_size_overrides=(7,)), 'parameter marker_size_overrides: 7 is not of type'),
         (lambda: MarkerMapperConfig(mode='surveying'), "parameter mode: 'surveying' is not one of"),
+        # rclpy ends a node that subscribes to such a topic with a traceback.
+        (lambda: MarkerMapperConfig(second_camera='2nd'), "second_camera: '2nd' is not the name of a namespace"),
+        (lambda: MarkerMapperConfig(second_camera='looks down'), "'looks down' is not the name of a namespace"),
+        (lambda: MarkerMapperConfig(second_camera='/down/'), "'/down/' is not the name of a namespace"),
     ],
 )
 def test_a_config_made_by_hand_checks_itself(make, words):
