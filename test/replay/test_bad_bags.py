@@ -165,6 +165,17 @@ def test_stamps_that_go_back(replay, recording, tmp_path, topic):
     assert warnings['messages_out']['pose'] == len(times) > 50
 
 
+def test_a_clock_that_was_set_by_years_during_the_recording(replay, recording, tmp_path):
+    """A minute of the gap is played: diagnostics of four nodes once a second, and of the rest of the bag."""
+    first_ns, topic, message = recording.events[0]
+    early = small_bag.Recording([(first_ns - 1_600_000_000_000_000_000, topic, message), *recording.events])
+    status, _ = replay(early.write(tmp_path / 'bag'))
+    assert status == 0
+    summary = json.loads((tmp_path / 'run' / 'summary.json').read_text())
+    assert summary['messages_out']['camera_pose'] == 15
+    assert 4 * 60 <= summary['messages_out']['/diagnostics'] <= 4 * 63
+
+
 def test_an_unknown_dictionary(replay, recording, tmp_path):
     params = tmp_path / 'other.yaml'
     params.write_text('/**: {ros__parameters: {dictionary: DICT_9X9_9}}')

@@ -74,6 +74,22 @@ def test_a_node_that_refuses_its_parameters_ends_the_replay(tmp_path, capfd):
     assert 'marker_size' in capfd.readouterr().err
 
 
+def test_a_gap_of_years_is_played_as_a_minute(tmp_path):
+    """A clock that was set during the recording; at 20 times real time, as a minute of waiting tests no more."""
+    recording = small_bag.recording(seconds=4.0)
+    first_ns, topic, message = recording.events[0]
+    recording.events.append((first_ns - 1_600_000_000_000_000_000, topic, message))
+    map_file, params = small_bag.side_files(tmp_path)
+    arguments = ['replay', recording.write(tmp_path / 'bag'), '--out', tmp_path / 'run', '--params', params]
+    arguments += ['--map', map_file, '--no-report', '--transport', 'processes', '--rate', '20']
+    assert main([str(word) for word in arguments]) == 0
+    summary = json.loads((tmp_path / 'run' / 'summary.json').read_text())
+    # Of 120; the nodes take those that they can at that rate.
+    assert summary['messages_out']['markers'] > 0
+    # A minute and four seconds of the bag, at that rate, are 3.2 s; what is measured is of that time.
+    assert max(summary['cpu_percent'].values()) > 1.0
+
+
 def test_latencies_are_paired_by_stamp():
     meter = LatencyMeter()
     meter.sent('image', 90, now_ns=0)

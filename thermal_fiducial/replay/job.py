@@ -3,8 +3,13 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.replay.recorder import Sink
 from thermal_fiducial.replay.topics import Playable, Topics
+
+#: Longest time without a message that is played as it is [ns]; a computer without a battery for its clock sets it by
+#: years when it finds a network, also in the middle of a recording.
+LONGEST_GAP_NS = 60 * SECOND_NS
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
 from thermal_fiducial.replay.domain import own_domain
-from thermal_fiducial.replay.job import ReplayJob
+from thermal_fiducial.replay.job import LONGEST_GAP_NS, ReplayJob
 from thermal_fiducial.replay.own_namespace import kind_of, own_arguments
 from thermal_fiducial.replay.recorder import Recorder
 from thermal_fiducial.replay.waiting import Wait
@@ -101,6 +101,7 @@ class _Graph:
         next_diagnosis = bag.start_ns + SECOND_NS
         last_ns = bag.start_ns
         for message in bag.messages(self._played):
+            next_diagnosis = max(next_diagnosis, message.stamp_ns - LONGEST_GAP_NS)
             while message.stamp_ns >= next_diagnosis:
                 self._diagnose(next_diagnosis)
                 self._job.progress(next_diagnosis - bag.start_ns)

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 import tempfile
 import time
@@ -22,7 +22,7 @@ from thermal_fiducial.files.bags import (
 from thermal_fiducial.files.images import header_stamp_ns
 from thermal_fiducial.replay.children import NodeProcesses
 from thermal_fiducial.replay.domain import own_domain
-from thermal_fiducial.replay.job import ReplayJob
+from thermal_fiducial.replay.job import LONGEST_GAP_NS, ReplayJob
 from thermal_fiducial.replay.latency import LatencyMeter
 from thermal_fiducial.replay.recorder import Recorder
 from thermal_fiducial.replay.waiting import Wait
@@ -95,14 +95,14 @@ class _Clock:
         """When a message of the bag is due, by the monotonic clock."""
         return self.start_ns + round((stamp_ns - self.bag_start_ns) / self.rate)
 
+    def without_gap(self, stamp_ns: int, before_ns: int) -> '_Clock':
+        """The clock for a message at ``stamp_ns`` of the bag, the next one after ``before_ns``."""
+        excess_ns = stamp_ns - before_ns - LONGEST_GAP_NS
+        return replace(self, start_ns=self.start_ns - round(excess_ns / self.rate)) if excess_ns > 0 else self
+
     def bag_ns(self, now_ns: int) -> int:
         """The bag's time, not before its start."""
         return self.bag_start_ns + max(0, round((now_ns - self.start_ns) * self.rate))
-
-    @property
-    def seconds(self) -> float:
-        """Seconds since the start."""
-        return (time.monotonic_ns() - self.start_ns) / SECOND_NS
 
 
 class _Player:
@@ -149,7 +149,9 @@ class _Player:
         bag = self._job.bag
         cpu = nodes.cpu_seconds()
         clock, late_ns, next_check = _Clock(bag.start_ns, rate), 0, 0
+        begun_ns, last_ns = clock.start_ns, bag.start_ns
         for message in _read_ahead(bag.messages(self._outputs)):
+            clock, last_ns = clock.without_gap(message.stamp_ns, last_ns), message.stamp_ns
             due_ns = clock.due_ns(message.stamp_ns)
             self._spin_until(due_ns, clock)
             self._job.check_interrupt()
@@ -163,7 +165,7 @@ class _Player:
                 nodes.check()
                 self._job.progress(elapsed)
                 next_check = elapsed + SECOND_NS
-        seconds = clock.seconds
+        seconds = (time.monotonic_ns() - begun_ns) / SECOND_NS
         used = {node: total - cpu[node] for node, total in nodes.cpu_seconds().items()}
         self._drain(nodes, clock)
         self._latency.write(self._job.files.folder / 'latency.csv')
