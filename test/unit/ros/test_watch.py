@@ -90,6 +90,9 @@ def test_silence_is_no_pose():
     waiting = LiveStatus()
     waiting.diagnostic(0.0, 'pose_ekf', 1, 'waiting for markers', {})
     assert waiting.snapshot(0.5).reasons == ('waiting for markers',)
+    unheard = LiveStatus()
+    unheard.diagnostic(0.0, 'pose_ekf', 0, 'tracking', {'lost': 'False'})
+    assert unheard.snapshot(0.5).reasons == ('no odometry is heard, but pose_ekf says: tracking',)
 
 
 def test_stamps_of_another_clock_give_no_latency():
@@ -112,6 +115,24 @@ def test_the_last_refusals_come_first_and_grow_old():
         (2.0, 'pose refused: 7.1 sigma'),
     )
     assert status.snapshot(500.0).refusals == ()
+
+
+def test_a_refusal_that_the_filter_repeats_while_no_poses_come_is_no_new_one():
+    status = flying()
+    refused = FIGURES | {'last refused pose': 'refused: 7.1 sigma'}
+    for second in (4.0, 5.0, 6.0):
+        status.diagnostic(second, 'pose_ekf', 1, 'coasting', refused)
+    assert status.snapshot(6.0).refusals == ((2.0, 'pose refused: 7.1 sigma'),)
+    status.camera_pose(6.5, 0.04)
+    status.diagnostic(7.0, 'pose_ekf', 1, 'tracking', refused)
+    assert status.snapshot(7.0).refusals == ((0.0, 'pose refused: 7.1 sigma'),)
+
+
+def test_a_node_that_starts_again_has_refused_nothing():
+    status = flying()
+    for second, count, reason in ((4.0, '5', 'encoding rgb8'), (5.0, '0', '')):
+        status.diagnostic(second, 'tau2_camera', 0, 'ok', {'refused messages': count, 'last refusal': reason})
+    assert [why for _, why in status.snapshot(5.0).refusals] == ['tau2_camera: encoding rgb8']
 
 
 def test_other_robots_do_not_count():

@@ -147,11 +147,17 @@ class LiveStatus:
             return
         before = self._nodes.get(node)
         self._nodes[node] = _Node(now, level, message, figures)
-        if refusal := figures.get(LAST_REFUSED):
+        refusal = figures.get(LAST_REFUSED)
+        # The filter repeats it until a pose is accepted, also while no pose comes.
+        if refusal and (
+            before is None
+            or refusal != before.figures.get(LAST_REFUSED)
+            or self._camera_pose.silent(now) < now - before.time
+        ):
             self._refuse(now, f'pose {refusal}')
-        counted = figures.get('refused messages', '0')
-        if before is not None and counted != before.figures.get('refused messages', '0'):
-            self._refuse(now, f'{node}: {figures.get("last refusal", "")}')
+        reason, counted = figures.get('last refusal'), figures.get('refused messages', '0')
+        if reason and before is not None and counted != before.figures.get('refused messages', '0'):
+            self._refuse(now, f'{node}: {reason}')
 
     def _refuse(self, now: float, words: str) -> None:
         if self._refusals and self._refusals[0][1] == words:
@@ -176,7 +182,8 @@ class LiveStatus:
         if not self._odometry.arrivals:
             if filter_ is None:
                 return ['nothing is heard of pose_ekf']
-            return [filter_.message]
+            known = filter_.figures.get('lost') == 'False'
+            return [f'no odometry is heard, but pose_ekf says: {filter_.message}' if known else filter_.message]
         reasons = []
         if (silent := self._odometry.silent(now)) > SILENT_S:
             reasons.append(f'no odometry for {silent:.1f} s')
