@@ -15,7 +15,8 @@ from support.tasks import write_twice
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bag_writer import BagWriter
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.replay import many_bags
 from thermal_fiducial.replay.workers import workers
@@ -76,6 +77,21 @@ def test_the_joint_map_starts_with_the_sides_of_the_parameters(tmp_path):
     parameters.write_text(f'/**: {{ros__parameters: {{{side}}}}}')
     assert batch(tmp_path, 'out', bags=['flight0']) == 0
     assert load_map(tmp_path / 'out' / 'marker_map.yaml').markers[0].size == small_bag.SIZE
+
+
+def test_markers_of_a_bag_that_the_mapper_refused_are_not_in_the_joint_map_either(folder, alone):
+    """A bag that begins with markers, of which a message is damaged."""
+    with BagWriter(folder / 'late') as bag, BagReader(alone / 'flight0' / 'output') as output:
+        first = True
+        for message in output.messages([MARKERS_TOPIC]):
+            data = small_bag.without_a_corner(message.cdr) if first else message.cdr
+            bag.write(MARKERS_TOPIC, message.stamp_ns, data, message.msgtype)
+            first = False
+        with BagReader(folder / 'flight0') as flight:
+            for message in flight.messages([IMU_TOPIC, CAMERA_INFO_TOPIC]):
+                bag.write(message.topic, message.stamp_ns, message.cdr, message.msgtype)
+    assert batch(folder, 'late_runs', '--workers', '1', bags=['late']) == 0
+    assert sorted(load_map(folder / 'late_runs' / 'marker_map.yaml').markers) == [0, 1, 2, 3]
 
 
 def test_the_calibration_of_a_bag_is_read_once(folder, monkeypatch):

@@ -68,6 +68,22 @@ def test_the_same_poses_as_from_images(folder, entry, transport):
         assert summary['messages_out']['pose'] > enough
 
 
+@pytest.mark.parametrize(
+    ('bad', 'status', 'words'), [(1, 0, '1 message refused'), (99, 2, 'not one message on markers')]
+)
+def test_markers_that_the_mapper_refuses_end_a_replay_only_if_all_are(folder, tmp_path, capfd, bad, status, words):
+    left = bad
+    with BagWriter(tmp_path / 'bag') as damaged, BagReader(folder / 'markers') as whole:
+        for message in whole.messages():
+            spoil = message.topic == 'markers' and left > 0
+            left -= spoil
+            data = small_bag.without_a_corner(message.cdr) if spoil else message.cdr
+            damaged.write(message.topic, message.stamp_ns, data, message.msgtype)
+    given = ['--map', folder / 'map.yaml', '--params', folder / 'params.yaml', '--no-report']
+    assert main([str(word) for word in ('replay', tmp_path / 'bag', '--out', tmp_path / 'run', *given)]) == status
+    assert words in capfd.readouterr().err
+
+
 @pytest.mark.parametrize('words', [('images', '--from', 'markers'), ('markers',)])
 def test_images_cannot_be_recorded_where_no_node_has_them(folder, words, capfd):
     assert replay(folder, *words, '--images') == 2

@@ -19,6 +19,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.geometry.se3 import apply, inverse, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.measurements import MARKER_DTYPE
 from thermal_fiducial.files import bag_messages
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMAGE_TOPIC, IMU_TOPIC
@@ -97,6 +98,15 @@ class Recording:
                 else:
                     bag.write(topic, stamp, message)
         return path
+
+
+def without_a_corner(cloud):
+    """The bytes of a cloud of markers, a corner of whose last one is no number."""
+    data = bytearray(cloud)
+    # The rows end the message, but for a byte.
+    begin = len(data) - 1 - MARKER_DTYPE.itemsize + MARKER_DTYPE.fields['u0'][1]
+    data[begin : begin + 4] = np.array(np.nan, '<f4').tobytes()
+    return bytes(data)
 
 
 def true_pose(t):

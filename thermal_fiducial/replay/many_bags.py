@@ -13,8 +13,7 @@ import shutil
 from typing import Any
 
 import numpy as np
-from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import CameraInfo, PointCloud2
+from sensor_msgs.msg import CameraInfo
 
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.camera import Camera
@@ -281,9 +280,12 @@ def _camera(run: Options, settings: Settings) -> Camera:
 
 
 def _frames(run: Options, most: int) -> list[Markers]:
-    """Detections of at most ``most`` frames with markers, evenly chosen."""
+    """Detections of at most ``most`` frames with markers, evenly chosen; those that the mapper refused are left out."""
+    frames = []
     with BagReader(run.run / 'output') as output:
-        messages = [deserialize_message(item.cdr, PointCloud2) for item in output.messages([MARKERS_TOPIC])]
-    messages = [message for message in messages if message.width]
-    chosen = np.linspace(0, len(messages) - 1, min(most, len(messages))).astype(int)
-    return [clouds.markers(messages[index]) for index in chosen]
+        for item in output.messages([MARKERS_TOPIC]):
+            with suppress(InputError):
+                frames.append(clouds.stamped_markers(item.cdr)[1])
+    frames = [rows for rows in frames if len(rows)]
+    chosen = np.linspace(0, len(frames) - 1, min(most, len(frames))).astype(int)
+    return [frames[index] for index in chosen]

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -116,7 +116,9 @@ class RunFiles:
         self._bag.write(topic, time_ns, data, self._types[topic])
         if topic in self._readers:
             kind, read = self._readers[topic]
-            read(deserialize_message(data, kind))
+            # A bag that begins behind the detector may have some that the nodes refuse, and say so.
+            with suppress(InputError):
+                read(deserialize_message(data, kind))
 
     @property
     def figures(self) -> dict[str, dict[str, str]]:

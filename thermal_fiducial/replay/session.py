@@ -219,7 +219,7 @@ def _report_refusals(files: RunFiles, entry: Entry, nodes: Sequence[str], warn: 
     Raises
     ------
     InputError
-        All images (or the inputs in their place), all calibrations or all IMU messages were refused.
+        All images or, in their place, all markers were refused, all calibrations, or all IMU messages.
     """
     needed = {'aruco_detector': ['thermal/image'], entry.nodes[0]: [entry.topic], 'pose_ekf': [IMU_TOPIC]}
     for node in nodes:
