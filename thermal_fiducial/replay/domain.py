@@ -15,7 +15,7 @@ _DOMAINS = range(1, 90)
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Number of a domain that no other replay on this machine uses, for as long as the context lasts.
+    """Number of a domain that no other replay on this machine uses, nor the user, for as long as the context lasts.
 
     Discovery is restricted to this machine, for this process and those that it starts.
 
@@ -25,7 +25,9 @@ def own_domain() -> Iterator[int]:
         All domains are in use.
     """
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    for domain in _DOMAINS:
+    # That of the environment: the user's robot may be flying in it.
+    of_user = os.environ.get('ROS_DOMAIN_ID')
+    for domain in (domain for domain in _DOMAINS if str(domain) != of_user):
         path = Path(tempfile.gettempdir()) / f'thermal_fiducial_{os.getuid()}_domain_{domain}.lock'
         try:
             # The folder is world-writable: a planted link is not followed, a planted file not truncated.
