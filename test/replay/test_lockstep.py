@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import sys
 import time
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import deserialize_message
 from support import small_bag
+import yaml
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, transform_from_quaternion
@@ -242,6 +244,18 @@ def test_a_callback_of_any_length_ends_nothing(folder, tmp_path, monkeypatch, ca
     summary = json.loads((tmp_path / 'run' / 'summary.json').read_text())
     assert summary['messages_out']['markers'] == summary['messages_in'][IMAGE_TOPIC] == 9
     assert 'Traceback' not in capfd.readouterr().err
+
+
+def test_a_rig_that_publishes_transforms_needs_no_tf2_in_a_replay(folder, tmp_path, monkeypatch):
+    """Where tf2 is, its publisher on /tf_static was not counted: the replay waited for ever."""
+    monkeypatch.setitem(sys.modules, 'tf2_ros', None)
+    bag = small_bag.recording(seconds=0.3).write(tmp_path / 'bag')
+    map_file, rig = small_bag.side_files(tmp_path)
+    tf = {'publish_tf': True, 'odom_frame': 'odom', 'smoothing_time': 0.5, 'publish_marker_tf': True}
+    rig.write_text(yaml.safe_dump({'/**': {'ros__parameters': small_bag.PARAMETERS | tf}}))
+    arguments = ['replay', bag, '--out', tmp_path / 'run', '--params', rig, '--map', map_file, '--no-report']
+    assert main([str(word) for word in arguments]) == 0
+    assert json.loads((tmp_path / 'run' / 'summary.json').read_text())['warnings'] == {}
 
 
 def test_a_recording_that_goes_on_after_its_imu_names_it(folder, capfd):

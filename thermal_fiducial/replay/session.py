@@ -27,6 +27,9 @@ from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED, Top
 from thermal_fiducial.ros.process.interrupts import Interrupts
 
 MAP_FILE, SUMMARY_FILE = 'marker_map.yaml', 'summary.json'
+#: No restart in flight: successive recordings are separate flights. No transforms: nobody takes them, tf2_ros need not
+#: be there, and its publishers do not count for lock-step.
+_NOT_IN_A_REPLAY = ('resume:=false', 'publish_tf:=false', "odom_frame:=''", 'publish_marker_tf:=false')
 
 
 @dataclass(frozen=True)
@@ -188,8 +191,8 @@ def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[
     except OSError as error:
         raise InputError(f'run folder {options.run}: {error.strerror}') from None
     run_map, given = options.run / MAP_FILE, settings.marker_mapper.map_file
-    # No restart in flight: successive recordings are separate flights.
-    arguments = ['--params-file', str(options.run / 'parameters.yaml'), '-p', 'resume:=false']
+    arguments = ['--params-file', str(options.run / 'parameters.yaml')]
+    arguments += [word for rule in _NOT_IN_A_REPLAY for word in ('-p', rule)]
     if not given:
         run_map.unlink(missing_ok=True)
         if 'marker_mapper' in entry.nodes:
