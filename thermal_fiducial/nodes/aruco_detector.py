@@ -10,7 +10,6 @@ from sensor_msgs.msg import Image, PointCloud2
 from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig, unknown_markers
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
-from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.ros.base import qos
@@ -67,13 +66,11 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
             self._marker_poses.send(clouds.marker_poses(markers, head))
         self._others.send(markers, head, self.detector.size)
         if self._annotated.listeners:
-            self._annotated.send(convert.image(display.annotated(self._gray(counts), markers), head))
+            gray = self.view(counts.astype(np.uint16, copy=False))
+            self._annotated.send(convert.image(display.annotated(gray, markers), head))
         if self.odometry.clock_is_known:
             self._dictionaries.settle()
         self._dictionaries.look(image.stamp_ns, counts, self.camera(), any_seen=self._seen > 0)
-
-    def _gray(self, counts: Counts | Gray) -> Gray:
-        return self.view(counts.astype(np.uint16, copy=False))
 
     def _on_map(self, message: PointCloud2) -> None:
         if self.detector is not None:

@@ -102,11 +102,13 @@ def _actions(
         'namespace': given['namespace'],
         'parameters': [_params_file(given['params_file'], share), overrides],
         'remappings': [*remappings, *_topics(given)],
-        'ros_arguments': ['--log-level', _log_level(given['log_level']), *_enclave(given['enclave'])],
+        'ros_arguments': ['--log-level', _log_level(given['log_level'])],
         # With what a group has set, for restarts after its end.
         'additional_env': {**os.environ, _DISCOVERY: _discovery_range(given['discovery_range'])},
         'output': 'screen',
     }
+    if given['enclave']:
+        settings['ros_arguments'] += ['--enclave', given['enclave']]
     if given['landing_pad']:
         overrides['landing_pad'] = _ids(given['landing_pad'])
     names = ['thermal_source', *NODES] if given['camera'] else list(NODES)
@@ -216,10 +218,6 @@ def _discovery_range(given: str) -> str:
     if asked.upper() not in _RANGES:
         raise InputError(f'discovery_range {asked}: not one of {", ".join(_RANGES)}')
     return asked.upper()
-
-
-def _enclave(name: str) -> list[str]:
-    return ['--enclave', name] if name else []
 
 
 def _rviz(namespace: str, share: Path) -> Any:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 import importlib
-import math
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
@@ -11,11 +10,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_msgs.msg import String
 
-from thermal_fiducial.core.geometry.se3 import (
-    camera_in_body,
-    inverse,
-    quaternion_from_rotation,
-)
+from thermal_fiducial.core.geometry.se3 import camera_in_body, inverse, quaternion_from_rotation, rotation_angle
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
@@ -139,7 +134,8 @@ class RobotFrames:
         new = source != self.source
         self.source, self.T_imu_base = source, T_imu_base
         if moved:
-            self._say(f', {np.linalg.norm(apart[:3, 3]):.3f} m and {_angle_deg(apart):.2f} deg from the previous pose')
+            angle_deg = np.degrees(rotation_angle(apart[:3, :3]))
+            self._say(f', {np.linalg.norm(apart[:3, 3]):.3f} m and {angle_deg:.2f} deg from the previous pose')
             self._node.configure(self._node.config)
             if self._on_moved is not None:
                 self._on_moved()
@@ -161,7 +157,3 @@ class RobotFrames:
 
 def _same(T: FloatArray, other: FloatArray) -> bool:
     return bool(np.allclose(T, other, rtol=0.0, atol=_SAME))
-
-
-def _angle_deg(T: FloatArray) -> float:
-    return math.degrees(2.0 * math.acos(min(abs(float(quaternion_from_rotation(T[:3, :3])[3])), 1.0)))

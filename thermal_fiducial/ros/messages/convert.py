@@ -98,7 +98,7 @@ def image(pixels: npt.NDArray[Any], head: Header) -> Image:
     encoding = 'bgr8' if pixels.ndim == 3 else 'mono16' if pixels.dtype == np.uint16 else 'mono8'
     message = Image(header=head, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
     message.is_bigendian = 0
-    message.step = pixels.strides[0] if pixels.flags.c_contiguous else pixels[0].nbytes
+    message.step = pixels[0].nbytes
     message.data = data_bytes(pixels)
     return message
 

@@ -131,10 +131,8 @@ def _topics_of_filter(node: Node, namespace: str) -> Topics | None:
 
 def _landing_topic(node: Node) -> str:
     """Remapped topic of the node landing_target; empty if it does not run."""
-    for namespace in _namespaces(node, _LANDING):
-        published = node.get_publisher_names_and_types_by_node(_LANDING, namespace)
-        return next((topic for topic, kinds in published if _POSE in kinds), '')
-    return ''
+    every = (node.get_publisher_names_and_types_by_node(_LANDING, space) for space in _namespaces(node, _LANDING))
+    return next((topic for published in every for topic, kinds in published if _POSE in kinds), '')
 
 
 def _namespaces(node: Node, wanted: str) -> list[str]:

@@ -198,13 +198,11 @@ class LiveStatus:
             said = self._nodes.get(node)
             if said is None or now - said.time > MUTE_S:
                 reasons.append(f'{node} says nothing')
-            elif said.level != _OK and not self._is_shutter(node, said):
+            elif said.level == _WARNING and node == _CAMERA and SHUTTER in said.message:
+                continue  # normal operation
+            elif said.level != _OK:
                 reasons.append(said.message if node == _FILTER else f'{node}: {said.message}')
         return reasons
-
-    def _is_shutter(self, node: str, said: _Node) -> bool:
-        """Whether the warning is a shutter event of the camera, which is normal operation."""
-        return node == _CAMERA and SHUTTER in said.message and said.level == _WARNING
 
     def _said(self, node: str, now: float) -> tuple[str, int, str]:
         said = self._nodes.get(node)
