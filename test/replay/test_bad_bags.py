@@ -288,6 +288,24 @@ def test_a_map_in_another_frame_and_parameters_of_others_are_doubted(replay, rec
     assert any('theirs.yaml: nothing in it is for our nodes: it is for their_node' in line for line in lines)
 
 
+@pytest.mark.parametrize(
+    ('parameters', 'doubted'), [('marker_size: 0.3', True), ('extrinsics: parameters', False), ('', False)]
+)
+def test_frames_of_a_robot_that_are_not_played_are_doubted_where_no_parameter_stands_in(
+    replay, recording, tmp_path, parameters, doubted
+):
+    """In flight the nodes had taken the place of the camera from them."""
+    urdf = small_bag.Raw('std_msgs/msg/String', b'\x00\x01\x00\x00\x01\x00\x00\x00\x00')
+    events = [(recording.events[0][0], '/drone/robot_description', urdf), *recording.events]
+    given = {}
+    if parameters:
+        given['params'] = tmp_path / 'rig.yaml'
+        given['params'].write_text(f'/**: {{ros__parameters: {{{parameters}}}}}')
+    status, lines = replay(small_bag.Recording(events).write(tmp_path / 'bag'), **given)
+    assert status == 0
+    assert any('does not play drone/robot_description' in line for line in lines) == doubted
+
+
 def test_a_camera_a_hundred_metres_from_the_imu_is_refused(replay, recording, tmp_path):
     params = tmp_path / 'other.yaml'
     params.write_text('/**: {ros__parameters: {camera_position: [100.0, 0.0, 0.0]}}')

@@ -8,7 +8,7 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from thermal_fiducial.config import MarkerMapperConfig, size_overrides
+from thermal_fiducial.config import MarkerMapperConfig, PoseEkfConfig, size_overrides
 from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import SECOND_NS
@@ -79,6 +79,7 @@ def replay(
     settings = _settings(options, warn)
     with _bag_of(options) as bag:
         entry, nodes, played, recorded = _cast(bag, options, settings)
+        _doubt_place_of_camera(bag, settings.pose_ekf, warn)
         also = {topic: PLAYED[topic] for topic in entry.also if topic in bag.topics}
         settings = _with_transport(settings, entry)
         arguments = _prepare(options, settings, entry, warn)
@@ -156,6 +157,18 @@ def _report_silence(files: RunFiles, nodes: Sequence[str], warn: Callable[[str],
     if not files.counts['pose']:
         reasons = '; '.join(f'{node}: {files.complaints[node]}' for node in nodes if node in files.complaints)
         warn(f'no pose went out. {reasons}')
+
+
+def _doubt_place_of_camera(bag: BagReader, config: PoseEkfConfig, warn: Callable[[str], None]) -> None:
+    """Warn of a bag from a robot whose frames said where the camera is: they are not played."""
+    frames = [name for name in bag.topics if name.rpartition('/')[2] in ('tf_static', 'robot_description')]
+    untouched = (config.camera_position, config.camera_orientation) == (
+        PoseEkfConfig.camera_position,
+        PoseEkfConfig.camera_orientation,
+    )
+    if frames and untouched and config.extrinsics == 'auto':
+        named = ' and '.join(sorted(frames))
+        warn(f'{bag.path}: a replay does not play {named}: set camera_position and camera_orientation (--params)')
 
 
 def _with_transport(settings: Settings, entry: Entry) -> Settings:
