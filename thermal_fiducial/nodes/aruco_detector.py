@@ -40,7 +40,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         self._annotated = self.advertise(Image, 'thermal/image_markers', qos.IMAGE_OUTPUT)
         self._images = self.subscribe_newest(Image, 'thermal/image', self._on_image, qos.IMAGE_INPUT, raw=True)
         self.follow_hints()
-        self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
+        self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED).regular = False
 
     def _make_detector(self) -> MarkerDetector | None:
         dictionary = load_dictionary(self.config.dictionary)

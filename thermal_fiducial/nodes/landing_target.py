@@ -39,7 +39,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT, raw=True)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
         self._corrections.follow_moves(self)
-        self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
+        self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED).regular = False
         RobotFrames(self)
 
     def _on_map(self, message: PointCloud2) -> None:

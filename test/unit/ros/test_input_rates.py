@@ -8,9 +8,11 @@ from thermal_fiducial.ros.base.input_rates import InputRates
 SECOND = 1_000_000_000
 
 
-def watched(*hertz, expected=0.0):
+def watched(*hertz, expected=0.0, regular=True):
     """Rates of inputs ``main``, ``other``, ..., whose messages of each second are ``hertz``."""
     inputs = [Input(f'/{name}') for name, _ in zip(('main', 'other', 'third'), hertz, strict=False)]
+    for source in inputs[1:]:
+        source.regular = regular
     rates = InputRates(inputs, expected)
     for second in range(len(hertz[0])):
         for source, counts in zip(inputs, hertz, strict=True):
@@ -48,6 +50,12 @@ def test_other_inputs_are_missed_only_if_they_came_all_the_time():
     assert (rates.stale, rates.doubt()) == (['other'], 'no other any more')
     assert rates.figures()['stale inputs'] == 'other'
     assert 'rate /third [Hz]' in rates.figures()
+
+
+def test_an_input_that_comes_when_there_is_something_new_is_not_missed():
+    """A map of a carpet changed in each of 22 seconds, then for two not at all."""
+    assert watched([30] * 24, [2] * 22 + [0] * 2).doubt() == 'no other any more'
+    assert watched([30] * 24, [2] * 22 + [0] * 2, regular=False).doubt() == ''
 
 
 def test_the_main_input_is_waited_for_and_missed():

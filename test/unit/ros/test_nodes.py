@@ -204,6 +204,16 @@ def test_a_missing_camera_info_is_reported_until_it_comes(graph):
     assert (level, figures['published /markers']) == (OK, '1')
 
 
+def test_a_map_that_rests_and_a_view_without_markers_are_no_doubts_of_the_detector(graph):
+    """A map that has changed in each of five seconds, and the clock offset, which comes with poses, stop."""
+    node = graph.add(ArucoDetector)
+    for second in range(8):
+        for source in node.inputs:
+            source.count += second < 5 or source.topic not in ('/marker_map', '/camera_clock')
+        node.diagnose(START + second * 1_000_000_000)
+    assert graph.diagnose(node)[2]['stale inputs'] == ''
+
+
 def test_an_uncalibrated_camera_info_does_not_replace_a_good_one(graph):
     node = graph.add(ArucoDetector)
     graph.send('thermal/camera_info', info(), CameraInfo(width=640, height=512))

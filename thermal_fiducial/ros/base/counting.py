@@ -44,6 +44,8 @@ class Input:
         self._number = 0
         #: of rclpy: what is counted
         self.subscription: Any = None
+        #: whether it comes at a rate, and is missed when it stops; else when there is something new
+        self.regular = True
 
     def newest(self, message: Any, at_most: int) -> Any:
         """The newest of a message that has been counted and those queued behind it, of which ``at_most`` are taken.

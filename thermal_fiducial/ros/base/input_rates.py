@@ -1,7 +1,7 @@
 """Rates of a node's inputs, and inputs that have stopped, as diagnostic_updater checks in C++ nodes.
 
 The main input is the first one that the node subscribed to. Its rate is compared with the expected one, a parameter or
-the rate of the first seconds. Any other steady input is reported when it stops.
+the rate of the first seconds. Any other regular and steady input is reported when it stops.
 """
 
 from collections import deque
@@ -121,7 +121,8 @@ class InputRates:
     @property
     def stale(self) -> list[str]:
         """Topics of the other inputs that were steady and have stopped."""
-        return [watch.topic for watch in list(self._watches.values())[1:] if watch.is_steady and watch.stopped]
+        others = [watch for watch in list(self._watches.values())[1:] if watch.source.regular]
+        return [watch.topic for watch in others if watch.is_steady and watch.stopped]
 
     def trouble(self) -> str:
         """Message for the pilot if the main input has not arrived yet or has stopped; else empty."""

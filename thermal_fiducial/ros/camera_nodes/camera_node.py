@@ -35,7 +35,8 @@ class CameraStageNode(StageNode[Config]):
         self.subscribe_lazily(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
         self.subscribe_lazily(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT)
         RobotFrames(self)
-        self.subscribe_lazily(TimeReference, 'camera_clock', self._on_camera_clock, qos.RESULT)
+        # One for each pose of a camera: that there are none is for the filter to say.
+        self.subscribe_lazily(TimeReference, 'camera_clock', self._on_camera_clock, qos.RESULT).regular = False
 
     def camera(self) -> Camera:
         """The calibration.
