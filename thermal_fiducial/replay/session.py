@@ -27,9 +27,17 @@ from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED, Top
 from thermal_fiducial.ros.process.interrupts import Interrupts
 
 MAP_FILE, SUMMARY_FILE = 'marker_map.yaml', 'summary.json'
-#: No restart in flight: successive recordings are separate flights. No transforms: nobody takes them, tf2_ros need not
-#: be there, and its publishers do not count for lock-step.
-_NOT_IN_A_REPLAY = ('resume:=false', 'publish_tf:=false', "odom_frame:=''", 'publish_marker_tf:=false')
+#: No restart in flight: successive recordings are separate flights. No outputs for others: nobody takes them, their
+#: packages need not be there, and publishers of tf2_ros do not count for lock-step.
+_NOT_IN_A_REPLAY = (
+    'resume:=false',
+    'publish_tf:=false',
+    "odom_frame:=''",
+    'publish_marker_tf:=false',
+    "detections:=''",
+    'image_annotations:=false',
+    'px4:=false',
+)
 
 
 @dataclass(frozen=True)
