@@ -95,11 +95,6 @@ class _Clock:
         """When a message of the bag is due, by the monotonic clock."""
         return self.start_ns + round((stamp_ns - self.bag_start_ns) / self.rate)
 
-    def without_gap(self, stamp_ns: int, before_ns: int) -> '_Clock':
-        """The clock for a message at ``stamp_ns`` of the bag, the next one after ``before_ns``."""
-        excess_ns = stamp_ns - before_ns - LONGEST_GAP_NS
-        return replace(self, start_ns=self.start_ns - round(excess_ns / self.rate)) if excess_ns > 0 else self
-
     def bag_ns(self, now_ns: int) -> int:
         """The bag's time, not before its start."""
         return self.bag_start_ns + max(0, round((now_ns - self.start_ns) * self.rate))
@@ -151,7 +146,7 @@ class _Player:
         clock, late_ns, next_check = _Clock(bag.start_ns, rate), 0, 0
         begun_ns, last_ns = clock.start_ns, bag.start_ns
         for message in _read_ahead(bag.messages(self._outputs)):
-            clock, last_ns = clock.without_gap(message.stamp_ns, last_ns), message.stamp_ns
+            clock, last_ns = self._past_gap(clock, last_ns, message.stamp_ns), message.stamp_ns
             due_ns = clock.due_ns(message.stamp_ns)
             self._spin_until(due_ns, clock)
             self._job.check_interrupt()
@@ -176,6 +171,15 @@ class _Player:
             'player_late_ms': late_ns * 1e-6,
         }
 
+    def _past_gap(self, clock: _Clock, last_ns: int, stamp_ns: int) -> _Clock:
+        """The clock from the message at ``stamp_ns`` of the bag on, a minute at most after that at ``last_ns``."""
+        end_ns = last_ns + LONGEST_GAP_NS
+        if stamp_ns <= end_ns:
+            return clock
+        self._spin_until(clock.due_ns(end_ns), clock)
+        self._file_all(clock)
+        return replace(clock, start_ns=clock.start_ns - round((stamp_ns - end_ns) / clock.rate))
+
     def _drain(self, nodes: NodeProcesses, clock: _Clock) -> None:
         """Receive the remaining outputs until all topics are silent and all nodes idle; slow machines may take long."""
         heard, idle = -1, 0
@@ -185,8 +189,7 @@ class _Player:
             if heard != (heard := sum(source.count for source in self._results())):
                 idle = 0
             idle += not nodes.working
-        while self._arrived:
-            self._file_one(clock)
+        self._file_all(clock)
 
     def _results(self) -> list[Any]:
         """Recorded topics that fall silent after the bag's end, so without diagnostics."""
@@ -208,6 +211,10 @@ class _Player:
                 self._file_one(clock)
             else:
                 self._executor.spin_once(timeout_sec=left / SECOND_NS)
+
+    def _file_all(self, clock: _Clock) -> None:
+        while self._arrived:
+            self._file_one(clock)
 
     def _file_one(self, clock: _Clock) -> None:
         topic, data, now = self._arrived.popleft()
