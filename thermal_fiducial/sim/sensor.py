@@ -4,7 +4,7 @@ Its values: NETD below 50 mK (FLIR), fixed-pattern noise that grows to about 0.1
 shutter, large-scale non-uniformity up to 0.6 K, shutter events of less than half a second.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -70,6 +70,21 @@ class Sensor:
         if self.ffc_behaviour not in FFC_BEHAVIOURS:
             raise InputError(f'driver behaviour {self.ffc_behaviour!r} is not one of {", ".join(FFC_BEHAVIOURS)}')
 
+    def without_noise(self) -> 'Sensor':
+        """The sensor without noise, drift, fixed pattern, bad pixels and shutter events."""
+        return replace(
+            self,
+            netd=0.0,
+            drift_counts=0.0,
+            pixel_pattern=0.0,
+            pixel_growth=0.0,
+            column_pattern=0.0,
+            column_growth=0.0,
+            shading=0.0,
+            bad_pixel_share=0.0,
+            ffc_period=0.0,
+        )
+
     def ffc_index(self, t: float) -> int:
         """Number of shutter events that have begun by ``t`` [s]."""
         if self.ffc_period <= 0:
@@ -131,14 +146,4 @@ def _bad_pixels(shape: tuple[int, int], share: float, seed: int, full_scale: int
     return where, stuck.astype(np.uint16)
 
 
-IDEAL = Sensor(
-    netd=0.0,
-    drift_counts=0.0,
-    pixel_pattern=0.0,
-    pixel_growth=0.0,
-    column_pattern=0.0,
-    column_growth=0.0,
-    shading=0.0,
-    bad_pixel_share=0.0,
-    ffc_period=0.0,
-)
+IDEAL = Sensor().without_noise()

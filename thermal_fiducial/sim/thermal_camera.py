@@ -11,7 +11,6 @@ from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.render import Quality, Renderer
 from thermal_fiducial.sim.scenario import named, Scenario
 from thermal_fiducial.sim.scene import Marker, Plate
-from thermal_fiducial.sim.sensor import IDEAL
 
 #: Stamp of the start of every flight.
 START_NS = 1_700_000_000_000_000_000
@@ -65,11 +64,7 @@ class FlightPlan:
     @property
     def sensor_scenario(self) -> Scenario:
         """The scenario; its sensor has no noise if ``noise`` is False."""
-        if self.noise:
-            return self.scenario
-        sensor = self.scenario.sensor
-        kept = ('lag', 'readout', 'psf_sigma_px', 'counts_per_kelvin', 'offset_counts', 'frame_rate')
-        return replace(self.scenario, sensor=replace(IDEAL, **{name: getattr(sensor, name) for name in kept}))
+        return self.scenario if self.noise else replace(self.scenario, sensor=self.scenario.sensor.without_noise())
 
     @property
     def frame_count(self) -> int:

@@ -100,6 +100,12 @@ def test_without_noise_there_is_no_shutter():
     assert not any(frame.shutter for frame in frames_of('frozen', noise=False))
 
 
+def test_without_noise_it_saturates_where_it_did():
+    scenario = replace(TINY, sensor=replace(TINY.sensor, full_scale=255, offset_counts=20.0))
+    # The warm surface, 15 K at 30 counts each, is beyond the scale.
+    assert next(render_frames(scenario, noise=False, start=40)).counts.max() == 255
+
+
 def test_refuses_an_unknown_behaviour():
     with pytest.raises(InputError, match='not one of frozen'):
         frames_of('blinking')
