@@ -134,8 +134,8 @@ def true_corners(
     """ID to corners (4, 2) [px] of the markers that lie wholly in the image, face the camera and are not hidden."""
     R, origin = T_map_camera[:3, :3], T_map_camera[:3, 3]
     high = np.array([lens.width, lens.height]) - 1 - _MARGIN_PX
-    poses = np.array([marker.T_map_marker for marker in markers])
-    points = (np.array([marker.corners_map for marker in markers]) - origin) @ R
+    poses = np.array([marker.T_map_marker for marker in markers]).reshape(-1, 4, 4)
+    points = (np.array([marker.corners_map for marker in markers]).reshape(-1, 4, 3) - origin) @ R
     faces = np.sum((origin - poses[:, :3, 3]) * poses[:, :3, 2], axis=1) > 0
     ahead = np.flatnonzero(faces & np.all(points[..., 2] >= 0.05, axis=1))
     pixels = lens.project(points[ahead])

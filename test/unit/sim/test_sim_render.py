@@ -139,6 +139,10 @@ def test_true_corners_are_opencvs():
         np.testing.assert_allclose(frame.corners_px[marker.id], expected, atol=1e-6)
 
 
+def test_a_room_without_markers_has_no_corners():
+    assert next(render_frames(replace(TINY, markers=()), noise=False, start=40)).corners_px == {}
+
+
 def test_corners_are_clockwise_from_the_top_left_and_the_code_reads():
     frame = next(render_frames(TINY, noise=False, start=40))
     low, high = np.percentile(frame.counts, [1, 99])
