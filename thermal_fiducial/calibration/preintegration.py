@@ -131,27 +131,29 @@ def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: Dens
     """
     dt = np.diff(times)
     count = len(dt)
-    steps = max(1, int(np.ceil(dt.max() / _STEP)))
-    h = (dt / steps)[:, None]
+    # Of each interval its own: the long one while no marker is in view leaves the others as they are.
+    steps = np.maximum(1, np.ceil(dt / _STEP).astype(np.int64))
     R, v, p = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((count, 3))
     by_bias, by_axes, covariance = np.zeros((count, 9, 6)), np.zeros((count, 9, AXES)), np.zeros((count, 9, 9))
     density = np.array([noise.gyroscope_noise_density] * 3 + [noise.accelerometer_noise_density] * 3) ** 2
-    for step in range(steps):
-        rate, force = imu.at(times[:-1] + (step + 0.5) * h[:, 0])
+    for step in range(int(steps.max())):
+        on = np.flatnonzero(steps > step)
+        h = (dt[on] / steps[on])[:, None]
+        rate, force = imu.at(times[on] + (step + 0.5) * h[:, 0])
         axes = axis_errors(rate, force)
-        rate, force = rate - bias[:, :3], force - bias[:, 3:]
+        rate, force = rate - bias[on, :3], force - bias[on, 3:]
         half = se3.so3_exp(0.5 * rate * h)
-        middle = R @ half
+        middle = R[on] @ half
         transition, inputs = _linearised(middle, force, half, h[:, :, None])
         # Bias enters like noise, with the opposite sign, as it is subtracted from the sample.
-        by_bias = transition @ by_bias - inputs
-        by_axes = transition @ by_axes - inputs @ axes
-        covariance = transition @ covariance @ np.swapaxes(transition, 1, 2)
-        covariance += inputs @ ((density / h)[:, :, None] * np.swapaxes(inputs, 1, 2))
+        by_bias[on] = transition @ by_bias[on] - inputs
+        by_axes[on] = transition @ by_axes[on] - inputs @ axes
+        covariance[on] = transition @ covariance[on] @ np.swapaxes(transition, 1, 2)
+        covariance[on] += inputs @ ((density / h)[:, :, None] * np.swapaxes(inputs, 1, 2))
         a = (middle @ force[:, :, None])[:, :, 0]
-        p = p + v * h + 0.5 * a * h**2
-        v = v + a * h
-        R = middle @ half
+        p[on] += v[on] * h + 0.5 * a * h**2
+        v[on] += a * h
+        R[on] = middle @ half
     return Increments(dt, R, v, p, by_bias, by_axes, covariance)
 
 
