@@ -72,10 +72,10 @@ def read_picture(path: Path) -> Counts | Gray:
         Not a picture of 8 or 16 bit.
     """
     image = load_picture(path, cv2.IMREAD_UNCHANGED)
+    if image.dtype not in (np.uint8, np.uint16) or min(image.shape[:2]) < 32:
+        raise InputError(f'{path}: a picture of {image.shape[1]}x{image.shape[0]} {image.dtype}, not 8 or 16 bit grey')
     if image.ndim == 3:
         image = cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY)
-    if image.dtype not in (np.uint8, np.uint16) or min(image.shape) < 32:
-        raise InputError(f'{path}: a picture of {image.shape[1]}x{image.shape[0]} {image.dtype}, not 8 or 16 bit grey')
     return image.astype(np.uint8) if image.dtype == np.uint8 else image.astype(np.uint16)
 
 

@@ -201,15 +201,17 @@ def test_unreadable_pictures_and_those_of_another_size_are_named(tmp_path, capsy
     cv2.imwrite(str(tmp_path / 'b.png'), counts[:200])
     (tmp_path / 'd.png').write_bytes(b'no picture')
     cv2.imwrite(str(tmp_path / 'e.png'), counts)
+    cv2.imwrite(str(tmp_path / 'f.tif'), np.zeros((256, 320, 3)))
     assert main(['calibrate', 'intrinsics', str(tmp_path), '--out', str(tmp_path / 'c.yaml')]) == 2
     out, err = capsys.readouterr()
     assert 'b.png: not used: 320x200 pixels, the views before it have 320x256' in out
     assert 'd.png: not used: not a readable picture' in out
     # The rest is looked at, and the line that ends it says what was wrong with which.
     assert 'e.png: 48 points' in out
-    assert '2 of 4 frames are usable views' in err
+    assert '2 of 5 frames are usable views' in err
     assert 'b.png: 320x200 pixels' in err
     assert 'd.png: not a readable picture' in err
+    assert 'f.tif: a picture of 320x256 float64, not 8 or 16 bit grey' in err
 
 
 @pytest.mark.parametrize(('tilt_deg', 'warns'), [(6.0, True), (35.0, False)])
