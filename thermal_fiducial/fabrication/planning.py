@@ -37,7 +37,9 @@ PACKAGED = Path(__file__).resolve().parent / 'measured.yaml'
 #: Share of measured markers found from which a marker counts as detected: four frames of five, 24 a second.
 DETECTED = 0.8
 
-_TABLES = ('narrow_px', 'contrast', 'tilt_deg', 'found', 'sigma_px', 'pose_sigma_px', 'distance_error')
+# Bounds of the axes, whose logarithms, or that of the cosine, are interpolated.
+_AXES = {'narrow_px': (1.0, 1e5), 'contrast': (1e-3, 1e6), 'tilt_deg': (0.0, 89.9)}
+_TABLES = (*_AXES, 'found', 'sigma_px', 'pose_sigma_px', 'distance_error')
 _SAMPLES = 200
 # Bits along a side of the measured markers; other markers are compared by the size of their cells.
 _MEASURED_BITS = 4
@@ -152,11 +154,14 @@ def load_measurements(path: str | os.PathLike[str] = PACKAGED) -> Measurements:
         tables = [np.array(document[name], dtype=np.float64) for name in _TABLES]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f'{path}: {one_line(error)} is missing or no table') from None
-    measurements = Measurements(*tables)
-    shape = len(measurements.narrow_px), len(measurements.contrast), len(measurements.tilt_deg)
-    if any(table.shape != shape for table in tables[3:]) or min(shape) < 2:
-        raise InputError(f'{path}: tables of {[table.shape for table in tables[3:]]} do not fit axes of {shape}')
-    return measurements
+    for (name, (least, most)), axis in zip(_AXES.items(), tables, strict=False):
+        rises = axis.ndim == 1 and len(axis) > 1 and bool(np.all(np.diff(axis) > 0.0))
+        if not (rises and least <= axis[0] and axis[-1] <= most):
+            raise InputError(f'{path}: {name} is not two or more rising numbers from {least:g} to {most:g}')
+    shape, shapes = tuple(map(len, tables[: len(_AXES)])), [table.shape for table in tables[len(_AXES) :]]
+    if set(shapes) != {shape}:
+        raise InputError(f'{path}: tables of {shapes} do not fit axes of {shape}')
+    return Measurements(*tables)
 
 
 def save_measurements(path: str | os.PathLike[str], measurements: Measurements, notes: dict[str, Any]) -> None:

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import yaml
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.cli.marker_measurement import camera_and_detector, show
@@ -215,6 +216,17 @@ def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / 'measured.yaml'
     path.write_text(content)
     with pytest.raises(InputError):
+        load_measurements(path)
+
+
+@pytest.mark.parametrize('axis', [5.0, [64.0, 16.0], [16.0, float('nan')], [[16.0], [64.0]], [0.0, 64.0], [16.0]])
+def test_axes_that_do_not_rise_are_refused(tmp_path, axis):
+    path = tmp_path / 'measured.yaml'
+    save_measurements(path, table(0.5, 0.05), {})
+    document = yaml.safe_load(path.read_text())
+    assert document['narrow_px'] == [16.0, 64.0]
+    path.write_text(yaml.safe_dump({**document, 'narrow_px': axis}))
+    with pytest.raises(InputError, match='narrow_px is not two or more rising numbers'):
         load_measurements(path)
 
 
