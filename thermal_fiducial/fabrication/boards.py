@@ -34,8 +34,8 @@ def circle_board(columns: int, rows: int, spacing: float, diameter: float, optio
     InputError
         Circles that touch, or a grid of too few or too many circles.
     """
-    if columns < 2 or rows < 2 or not 0.0 < diameter < spacing * np.sqrt(2.0) - 1.0:
-        raise InputError('a circle grid needs 2 x 2 circles or more, and a millimetre of acrylic between them')
+    if columns < 2 or rows < 3 or not 0.0 < diameter < spacing * np.sqrt(2.0) - 1.0:
+        raise InputError('a circle grid needs 2 x 3 circles or more, and a millimetre of acrylic between them')
     if columns * rows > _MOST_CIRCLES:
         raise InputError(f'a circle grid of {columns} x {rows}: {_MOST_CIRCLES} circles at most')
     # Small circles must not run into the mounting holes in the corners.

@@ -16,6 +16,7 @@ from shapely.ops import unary_union
 from support.commands import status
 from support.opencv import opencv_detector, opencv_dictionary
 
+from thermal_fiducial.calibration.targets import CircleGrid
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import circle_board
@@ -329,6 +330,14 @@ def test_circle_board_reads_as_a_grid(tmp_path):
     found, centres = cv2.findCirclesGrid(preview, (4, 11), flags=cv2.CALIB_CB_ASYMMETRIC_GRID)
     assert found
     assert len(centres) == 44
+
+
+@pytest.mark.parametrize('grid', [(1, 11), (2, 2)])
+def test_no_board_is_drawn_that_calibration_refuses(grid):
+    with pytest.raises(InputError, match='2 x 3 circles or more'):
+        CircleGrid(*grid, 0.025, 0.020)
+    with pytest.raises(InputError, match='2 x 3 circles or more'):
+        circle_board(*grid, 25.0, 20.0, PlateOptions())
 
 
 def test_small_circles_of_a_board_keep_away_from_its_mounting_holes():
