@@ -16,10 +16,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from thermal_fiducial.core.types import Gray
+from thermal_fiducial.core.types import Float32Array, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bit_patterns import cuttable, rotate, rotations, unpack, weight, Words
 from thermal_fiducial.fabrication.cuttability import examine
+
+# Markers that are compared with all at a time: 30,000 among themselves would take gigabytes.
+_AT_A_TIME = 256
 
 
 @dataclass
@@ -175,12 +178,22 @@ def distances(bits: Gray) -> tuple[int, int]:
     """
     between = own = bits.shape[-1] ** 2
     for turns in range(4):
-        differing = np.sum(bits[:, None] != np.rot90(bits, turns, axes=(1, 2))[None], axis=(2, 3))
-        if turns:
-            own = min(own, int(np.min(np.diagonal(differing))))
-        if len(bits) > 1:
-            between = min(between, int(np.min(differing[~np.eye(len(bits), dtype=bool)])))
+        turned = np.rot90(bits, turns, axes=(1, 2))
+        for first in range(0, len(bits), _AT_A_TIME):
+            differing = _differing(bits[first : first + _AT_A_TIME], turned)
+            itself = np.arange(len(differing)), first + np.arange(len(differing))
+            if turns:
+                own = min(own, int(differing[itself].min()))
+            differing[itself] = between
+            between = min(between, int(differing.min()))
     return between, own
+
+
+def _differing(bits: Gray, others: Gray) -> Float32Array:
+    """Hamming distances (A, B) of patterns (A, n, n) and (B, n, n)."""
+    # Of signs the scalar product is the number of equal bits less that of differing ones.
+    signs, of_others = (1.0 - 2.0 * b.reshape(len(b), -1).astype(np.float32) for b in (bits, others))
+    return np.asarray(0.5 * (signs.shape[1] - signs @ of_others.T), dtype=np.float32)
 
 
 def negatives(bits: Gray, closer_than: int) -> list[tuple[int, int, int]]:
@@ -191,7 +204,6 @@ def negatives(bits: Gray, closer_than: int) -> list[tuple[int, int, int]]:
     bits : (M, n, n)
     closer_than : only pairs that differ in fewer bits
     """
-    turned = np.stack([np.rot90(1 - bits, turns, axes=(1, 2)) for turns in range(4)])
-    differing = np.min(np.sum(bits[:, None] != turned[:, None], axis=(3, 4)), axis=0)
+    differing = np.min([_differing(bits, np.rot90(1 - bits, turns, axes=(1, 2))) for turns in range(4)], axis=0)
     pairs = np.argwhere(np.triu(differing < closer_than))
     return [(int(a), int(b), int(differing[a, b])) for a, b in pairs]

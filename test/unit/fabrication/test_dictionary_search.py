@@ -1,6 +1,7 @@
 from itertools import combinations
 from pathlib import Path
 import re
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -146,6 +147,16 @@ def test_search_depends_on_its_seed_only():
     assert np.array_equal(first, again)
     assert not np.array_equal(first, other)
     assert min(distances(first)) >= 6
+
+
+def test_distances_of_many_markers_take_little_memory():
+    bits = unpack(np.random.default_rng(1).integers(0, 1 << 36, 3000, dtype=np.uint64), 6)
+    tracemalloc.start()
+    distances(bits)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    # A block of 256 x 3000 numbers is 3 MB, of which some are made on the way; all pairs bit by bit were 324 MB.
+    assert most < 30e6
 
 
 @pytest.mark.parametrize(('bits', 'distance'), [(2, 4), (9, 4), (4, 0), (4, 17), (3, 9)])
