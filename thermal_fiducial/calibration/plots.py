@@ -100,13 +100,14 @@ def _field(size: tuple[int, int], pixels: FloatArray, residuals: FloatArray) -> 
         np.bincount(cell, weights=values, minlength=GRID[0] * GRID[1])[filled] / count[filled]
         for values in (*pixels.T, *residuals.T)
     )
-    # Scaled so that 95 % of the arrows are shorter than a cell; longer ones are of few points.
-    long = max(float(np.percentile(np.hypot(du, dv), 95.0)) if len(filled) else 0.0, 1e-6)
-    scale = long * GRID[0] / size[0]
-    arrows = axes.quiver(u, v, du, dv, angles='xy', scale_units='xy', scale=scale, color=_INK, width=0.004)
     _frame(axes, size)
-    # Below, beside the name of the axis: above it would run into the title.
-    axes.quiverkey(arrows, 0.95, -0.1, long, f'{long:.2g} px', labelpos='W')
+    if len(filled):
+        # Scaled so that 95 % of the arrows are shorter than a cell; longer ones are of few points.
+        long = max(float(np.percentile(np.hypot(du, dv), 95.0)), 1e-6)
+        scale = long * GRID[0] / size[0]
+        arrows = axes.quiver(u, v, du, dv, angles='xy', scale_units='xy', scale=scale, color=_INK, width=0.004)
+        # Below, beside the name of the axis: above it would run into the title.
+        axes.quiverkey(arrows, 0.95, -0.1, long, f'{long:.2g} px', labelpos='W')
     return _html(figure, 'mean residual of each cell')
 
 
@@ -149,6 +150,7 @@ def _bars(names: Sequence[str], residuals: Sequence[FloatArray]) -> str:
     width = _WIDE[0] + _INCHES_A_NAME * max(0, len(names) - _NAMES_IN_WIDTH)
     figure, axes = _figure('rms of each view', (width, _WIDE[1]))
     axes.bar(range(len(names)), [float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))) for residual in residuals])
-    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    # Names of files are no formulas, whatever is between two dollar signs.
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=7, parse_math=False)
     axes.set(ylabel='[px]', xlim=(-0.7, len(names) - 0.3))
     return _html(figure, 'rms of each view', wide=True)

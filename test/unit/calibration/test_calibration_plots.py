@@ -4,9 +4,14 @@ from itertools import pairwise
 
 from matplotlib.figure import Figure
 import numpy as np
+import pytest
 
 from thermal_fiducial.calibration.lens_check import ImageError
 from thermal_fiducial.calibration.plots import drawings
+
+U, V = np.meshgrid(np.linspace(0.0, 639.0, 17), np.linspace(0.0, 511.0, 13))
+SIGMA = 0.01 + 1e-3 * np.hypot(U - 320.0, V - 256.0)
+ERROR = ImageError(U[0], V[:, 0], SIGMA, SIGMA < 0.2, 0.5)
 
 
 def test_numbers_of_an_axis_do_not_run_into_each_other(monkeypatch):
@@ -21,13 +26,17 @@ def test_numbers_of_an_axis_do_not_run_into_each_other(monkeypatch):
     pixels = rng.uniform((0.0, 0.0), (640.0, 512.0), (400, 2))
     # Residuals between -0.09 and 0.11 px had nine numbers of three digits below a drawing of 4 inches.
     residuals = np.array([0.11, 0.1]) * rng.uniform(-0.8, 1.0, (400, 2))
-    u, v = np.meshgrid(np.linspace(0.0, 639.0, 17), np.linspace(0.0, 511.0, 13))
-    sigma = 0.01 + 1e-3 * np.hypot(u - 320.0, v - 256.0)
-    error = ImageError(u[0], v[:, 0], sigma, sigma < 0.2, 0.5)
-    drawings((640, 512), pixels, [residuals[:200], residuals[200:]], ['a.png', 'b.png'], error)
+    drawings((640, 512), pixels, [residuals[:200], residuals[200:]], ['a.png', 'b.png'], ERROR)
     assert len(figures) == 5
     for figure in figures:
         labels = [label for label in figure.axes[0].get_xticklabels() if label.get_text()]
         boxes = sorted((label.get_window_extent() for label in labels), key=lambda box: box.x0)
         # Three pixels at 100 dots per inch: a gap that the eye sees between two numbers.
         assert all(right.x0 - left.x1 >= 3.0 for left, right in pairwise(boxes)), figure.axes[0].get_title()
+
+
+@pytest.mark.filterwarnings('error')
+def test_few_points_and_odd_names_are_drawn():
+    # No cell has the points of a mean; matplotlib reads what is between dollar signs as a formula, and this is none.
+    pixels = np.random.default_rng(0).uniform((0.0, 0.0), (640.0, 512.0), (9, 2))
+    assert 'a$_$.png' in drawings((640, 512), pixels, [np.full((9, 2), 0.1)], ['a$_$.png'], ERROR)
