@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from shapely.geometry import LinearRing
 
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
@@ -106,7 +107,7 @@ def contour(corners: FloatArray, kerf: float, radius: float) -> Contour:
     Raises
     ------
     InputError
-        A hole or gap that the kerf fills.
+        A hole or gap that the kerf fills, or that a rounded corner reaches across.
     """
     before, after = corners - np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0) - corners
     length = np.linalg.norm(after, axis=1, keepdims=True)
@@ -117,7 +118,10 @@ def contour(corners: FloatArray, kerf: float, radius: float) -> Contour:
     if np.any(moved_length <= 0.0):
         raise InputError(f'a gap of {float(length.min()):.3g} mm is closed by a kerf of {kerf:g} mm')
     reentrant = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] < 0
-    return _rounded(moved, forward, moved_length, np.where(reentrant, radius, 0.0))
+    rounded = _rounded(moved, forward, moved_length, np.where(reentrant, radius, 0.0))
+    if not LinearRing(rounded.flattened()).is_simple:
+        raise InputError(f'corners of radius {radius:g} mm reach across a gap: a smaller --corner-radius is needed')
+    return rounded
 
 
 def _rounded(corners: FloatArray, forward: FloatArray, length: FloatArray, radii: FloatArray) -> Contour:

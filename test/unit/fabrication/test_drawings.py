@@ -332,6 +332,14 @@ def test_circle_board_reads_as_a_grid(tmp_path):
     assert len(centres) == 44
 
 
+def test_corners_that_reach_across_a_ring_are_refused():
+    # A corner of radius r reaches 0.41 r towards the black square, whose corner is 1.41 times the ring away: 3.5 mm.
+    with pytest.raises(InputError, match='corners of radius 10 mm reach across a gap'):
+        marker_drawing(BITS[0], '0', PlateOptions(size=50.0, mount='frame', corner_radius=10.0, quiet_cells=0.3))
+    sound = PlateOptions(size=50.0, mount='frame', corner_radius=8.0, quiet_cells=0.3)
+    assert problems(marker_drawing(BITS[0], '0', sound), 1) == []
+
+
 @pytest.mark.parametrize('grid', [(1, 11), (2, 2)])
 def test_no_board_is_drawn_that_calibration_refuses(grid):
     with pytest.raises(InputError, match='2 x 3 circles or more'):
