@@ -11,6 +11,7 @@ rows that they are computed from.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 
@@ -86,7 +87,7 @@ def calibrate_camera_imu(
         Too few poses, no IMU samples around them, or motion that the answer cannot be read from.
     """
     recording = _RigRecording(imu, start_ns)
-    poses = [pose for pose, use in zip(poses, recording.covers(poses), strict=True) if use]
+    poses = list(compress(poses, recording.covers(poses)))
     _, first = recording.solved(poses, noise)
     problem, second = recording.solved(poses, imu.noise(noise), first.jitter, first.state)
     return _answer(problem.repeated(second), np.inf)
@@ -113,8 +114,7 @@ def calibrate_rolling_camera_imu(
     """
     recording = _RigRecording(imu, start_ns)
     at_once = _solved(frames, camera)
-    inside = recording.covers([frame.pose for frame in at_once])
-    at_once = [frame for frame, use in zip(at_once, inside, strict=True) if use]
+    at_once = list(compress(at_once, recording.covers([frame.pose for frame in at_once])))
     solved, _, first = _rolling(recording, at_once, camera, noise)
     shaken = imu.noise(noise)
     _, problem, second = _rolling(recording, solved, camera, shaken, first.jitter, first.state)

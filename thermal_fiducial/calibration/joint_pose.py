@@ -70,7 +70,7 @@ def solve_camera_pose(
     squared = np.sum((corners - seen.reshape(-1, 4, 2)) ** 2, axis=-1)
     if not (np.isfinite(chi2[best]) and np.isfinite(squared).all()):
         raise InputError(f'no camera pose explains the {len(corners)} markers')
-    covariance = _of_camera(_covariances(information[best]), T[best], squares.mean(axis=(0, 1)))
+    covariance = _of_camera(_covariance(information[best]), T[best], squares.mean(axis=(0, 1)))
     return JointPose(T[best], covariance, float(np.sqrt(squared.mean())))
 
 
@@ -89,16 +89,15 @@ def _single_markers(normalised: FloatArray, squares: FloatArray) -> FloatArray:
     return (T_map_square[:, None] @ se3.inverse(ippe_square(normalised, sizes))).reshape(-1, 4, 4)
 
 
-def _covariances(information: FloatArray) -> FloatArray:
-    """Covariances (B, 6, 6); inf where some direction is undetermined, which a pseudo-inverse would hide."""
-    scale = np.sqrt(np.maximum(np.einsum('...ii->...i', information), 1e-300))
-    scale = scale[..., :, None] * scale[..., None, :]
+def _covariance(information: FloatArray) -> FloatArray:
+    """Covariance (6, 6); inf where some direction is undetermined, which a pseudo-inverse would hide."""
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scale = np.outer(scale, scale)
     # The ridge is below the rounding of determined directions, and keeps undetermined ones from being singular.
     inflation = np.linalg.inv(information / scale + 1e-14 * np.eye(6))
-    own = np.einsum('...ii->...i', inflation)
-    known = np.all((own > 0.0) & (own < _UNKNOWN), axis=-1)
-    covariance = 0.5 * (inflation + np.swapaxes(inflation, -1, -2)) / scale
-    return np.where(known[..., None, None], covariance, np.inf)
+    own = np.diag(inflation)
+    known = np.all((own > 0.0) & (own < _UNKNOWN))
+    return np.asarray(0.5 * (inflation + inflation.T) / scale if known else np.full((6, 6), np.inf))
 
 
 def _of_camera(covariance: FloatArray, T_map_camera: FloatArray, middle: FloatArray) -> FloatArray:

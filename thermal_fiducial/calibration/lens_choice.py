@@ -44,10 +44,6 @@ class _FittedLens:
     usable: bool
 
     @property
-    def size(self) -> int:
-        return len(self.fit.free)
-
-    @property
     def error(self) -> float:
         return float(np.mean(self.squares))
 
@@ -91,15 +87,13 @@ def choose_model(
     if not chosen:
         raise InputError('no lens model fits these views that goes on growing out to the corners of the image')
     best = min(chosen.values(), key=lambda candidate: candidate.error)
-    equals = [
-        candidate for candidate in chosen.values() if candidate is best or not best.clearly_better_than(candidate)
-    ]
-    simplest = min(equals, key=lambda candidate: (candidate.size, CANDIDATES.index(candidate.fit.camera.model)))
+    equals = [candidate.fit for candidate in chosen.values() if not best.clearly_better_than(candidate)]
+    simplest = min(equals, key=lambda fit: (len(fit.free), CANDIDATES.index(fit.camera.model)))
     fits = {
         model: replace(candidate.finished(), views=reference.views, dropped=reference.dropped)
         for model, candidate in chosen.items()
     }
-    return fits[simplest.fit.camera.model], fits
+    return fits[simplest.camera.model], fits
 
 
 def _start(
@@ -116,7 +110,8 @@ def _stepwise(sightings: Sequence[Sighting], start: Calibration, radius: float) 
     poses = np.stack([board_pose(sighting, camera) for sighting in sightings])
     groups = _GROUPS[camera.model]
     entered = [0] * len(groups)
-    current = _candidate(sightings, replace(start, camera=camera, T_camera_board=poses), (), radius)
+    bare = _fit(sightings, replace(start, camera=camera, T_camera_board=poses), (), radius)
+    current = _held_out(sightings, bare, radius)
     best = current if current.usable else None
     while True:
         steps = [
@@ -133,11 +128,6 @@ def _stepwise(sightings: Sequence[Sighting], start: Calibration, radius: float) 
             best = current
 
 
-def _candidate(sightings: Sequence[Sighting], near: Calibration, free: tuple[int, ...], radius: float) -> _FittedLens:
-    """Fit from a solution ``near`` by."""
-    return _held_out(sightings, _fit(sightings, near, free, radius), radius)
-
-
 def _step(
     sightings: Sequence[Sighting], current: Calibration, free: tuple[int, ...], radius: float
 ) -> _FittedLens | None:
@@ -151,6 +141,7 @@ def _step(
 
 
 def _fit(sightings: Sequence[Sighting], near: Calibration, free: tuple[int, ...], radius: float) -> Calibration:
+    """Fit from a solution ``near`` by."""
     return calibrate_from(sightings, near.camera, near.T_camera_board, radius=radius, free=free, drop=False)
 
 

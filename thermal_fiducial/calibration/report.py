@@ -139,7 +139,10 @@ def _view_figures(calibration: Calibration, views: Sequence[BoardView]) -> str:
         _view_figure(views[index], residual, enlarged, calibration)
         for index, residual in zip(calibration.views.tolist(), calibration.residuals, strict=True)
     ]
-    figures += [_dropped_figure(views[index], calibration) for index in calibration.dropped]
+    figures += [
+        _figure(views[index], '', f'{len(views[index].sighting.pixels)} points, not used', calibration)
+        for index in calibration.dropped
+    ]
     text = f'<p>Residuals, measured minus predicted, are drawn {enlarged:.0f} times as long as they are.</p>'
     return f'{text}<div class="views">{"".join(figures)}</div>'
 
@@ -153,10 +156,6 @@ def _view_figure(view: BoardView, residual: FloatArray, enlarged: float, calibra
     )
     caption = f'{len(residual)} points, rms {rms:.3f} px, largest {worst:.2f} px'
     return _figure(view, lines, caption, calibration)
-
-
-def _dropped_figure(view: BoardView, calibration: Calibration) -> str:
-    return _figure(view, '', f'{len(view.sighting.pixels)} points, not used', calibration)
 
 
 def _figure(view: BoardView, lines: str, caption: str, calibration: Calibration) -> str:
