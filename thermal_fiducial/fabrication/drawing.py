@@ -4,7 +4,7 @@ Millimetres, x to the right, y up, the origin at the lower left of the acrylic. 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -103,7 +103,7 @@ class Drawing:
     #: expected number of separate pieces of acrylic
     parts: int = 1
     #: instructions for cutting and mounting, one line a part
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
     def moved(self, dx: float, dy: float) -> 'Drawing':
         """The drawing, shifted."""

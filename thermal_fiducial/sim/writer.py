@@ -151,7 +151,7 @@ def _body_events(flight: FlightPlan) -> Iterator[_Event]:
 
 
 def _arrivals(record: ImuRecord, stamps: IntArray, scenario: Scenario) -> list[int]:
-    """Samples that arrive and their stamps, through the driver of the scenario if it has one."""
+    """Times [ns] at which samples are read, in order: those of the ``stamps``, or at which a driver stamps them."""
     if scenario.imu.delivery is None:
         return stamps.tolist()  # type: ignore[no-any-return]
     return np.maximum.accumulate(record.stamps_ns).tolist()  # type: ignore[no-any-return]
