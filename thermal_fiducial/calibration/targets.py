@@ -164,14 +164,15 @@ class MarkerBoard:
 
     Parameters
     ----------
-    board : their map
+    board : their map; markers in quarantine are left alone
     detector : of the dictionary of the map
     """
 
     radius = 0.0
 
     def __init__(self, board: MarkerMap, detector: Detector) -> None:
-        self._board, self._detector = board, detector
+        self._markers = {key: marker for key, marker in board.markers.items() if marker.trusted}
+        self._detector = detector
         self._stamp_ns = 0
 
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
@@ -179,10 +180,10 @@ class MarkerBoard:
         # Views are independent: stamps far apart keep the detector from predicting motion between them.
         self._stamp_ns += _APART_NS
         rows = self._detector.detect(self._stamp_ns, counts, camera)
-        rows = rows[np.isin(rows['id'], list(self._board.markers))]
+        rows = rows[np.isin(rows['id'], list(self._markers))]
         if len(rows) < 2:
             raise BoardNotFound(f'{number_of(len(rows), "marker")} of the board, of which two are needed')
-        markers = [self._board.markers[marker_id] for marker_id in rows['id'].tolist()]
+        markers = [self._markers[marker_id] for marker_id in rows['id'].tolist()]
         T = np.stack([marker.T_map_marker for marker in markers])
         points = corners_in_map(T, np.array([marker.size for marker in markers]))
         return Sighting(points.reshape(-1, 3), corners_px(rows).reshape(-1, 2))

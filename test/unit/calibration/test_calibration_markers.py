@@ -1,5 +1,7 @@
 """A board of our own stencils: found through the package's own detector, in part or whole."""
 
+from dataclasses import replace
+
 import numpy as np
 from support.boards import plate_pose, random_view, render
 
@@ -10,6 +12,7 @@ from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.measurements import MARKER_DTYPE
 from thermal_fiducial.fabrication.boards import marker_grid
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.scenario import LENSES
@@ -65,3 +68,17 @@ def test_marker_board_calibrates():
     # Twelve views in place of forty.
     assert abs(found.camera.K[0, 0] / lens.focal[0] - 1.0) < 2e-3
     assert np.all(np.abs(found.camera.K[:2, 2] - lens.centre) < 1.5)
+
+
+def test_markers_in_quarantine_are_left_alone():
+    marker_map, _ = board()
+    marker_map.markers[1] = replace(marker_map.markers[1], trusted=False)
+    rows = np.zeros(3, MARKER_DTYPE)
+    rows['id'] = 0, 1, 2
+
+    class Seen:
+        def detect(self, stamp_ns, counts, camera):
+            return rows
+
+    camera = Camera(640, 512, LENSES['13mm'].matrix)
+    assert len(MarkerBoard(marker_map, Seen()).find(np.zeros((512, 640), np.uint16), camera).points) == 8
