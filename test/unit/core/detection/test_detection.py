@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from support.scenes import camera_of
 
-from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, MARKER_DTYPE
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -46,6 +47,17 @@ def test_no_markers_give_no_rows(detector):
     rows = detector.detect(0, noise, camera)
     assert rows.dtype == MARKER_DTYPE
     assert len(rows) == 0
+
+
+def test_a_picture_of_8_bits_gives_the_same_in_16(frames):
+    """The front end passes pictures on in 16 bits."""
+    view, camera = EightBitView(Tau2CameraConfig()), camera_of(named('wall'))
+    pictures = [(frame.stamp_ns, view(frame.counts)) for frame in frames]
+    detectors = {dtype: new_detector() for dtype in (np.uint8, np.uint16)}
+    for stamp_ns, picture in pictures:
+        rows, others = (of.detect(stamp_ns, picture.astype(dtype), camera) for dtype, of in detectors.items())
+        assert len(rows) > 0
+        np.testing.assert_array_equal(rows, others)
 
 
 def test_a_calibration_of_another_image_size_is_named(detector):

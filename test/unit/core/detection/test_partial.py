@@ -109,8 +109,8 @@ def test_a_gray_scale_displaces_no_corner_in_a_turn(view, bent, white):
     camera, (image, T, twist) = CAMERAS['plumb_bob'], turning(view, 1.0)
     gray = np.rint(20.0 + 235.0 * np.clip(image / white, 0.0, 1.0) ** bent).astype(np.uint8)
     frame = Frame.of(0, gray, camera, twist, replace(CONFIG, bolometer_lag=LAG), keep_columns=True)
-    scale = GrayScale((np.clip(np.arange(256) - 20.0, 0.0, None) / 235.0) ** (1.0 / bent), slice(20, 256))
-    ids, found = look_at(frame, T, scale=scale)
+    counts = 235.0 * (np.clip(np.arange(256) - 20.0, 0.0, None) / 235.0) ** (1.0 / bent)
+    ids, found = look_at(frame, T, scale=GrayScale(counts, slice(20, 256)))
     assert ids.tolist() == [ID]
     error = found.corners_px[0] - camera.project(se3.apply(T, marker_corners(SIZE)))
     # When written at most 0.052 px; in gray levels 0.17 to 0.44 px.

@@ -36,7 +36,7 @@ _MATTERS = 0.02
 
 
 class GrayScale(NamedTuple):
-    """Counts of the gray levels of a display, but for their zero and unit."""
+    """Counts of the gray levels of a display; their zero and unit are about those of the gray levels."""
 
     #: (256,) rising
     counts: FloatArray

@@ -72,9 +72,8 @@ class Frame:
     readout: float
     #: whether it is a picture for a display, whose gain control is a nonlinear function of the counts
     displayed: bool = False
-    #: (height, width) as received, and whether the fixed pattern of its columns is removed from ``image``
+    #: (height, width) as received
     received: Counts | Gray | None = None
-    corrected: bool = False
 
     @staticmethod
     def of(
@@ -86,14 +85,13 @@ class Frame:
         *,
         keep_columns: bool,
     ) -> 'Frame':
-        """A frame; the fixed pattern of its columns is removed unless ``keep_columns`` or the pixels have 8 bits."""
+        """A frame; the fixed pattern of its columns is removed unless ``keep_columns``."""
         noise, displayed = pixel_noise(counts), bool(counts[::_ROW_STEP].max() < _LEVELS)
         lag, readout = config.bolometer_lag, config.readout_time
         image = counts.astype(np.float32)
-        corrected = counts.dtype != np.uint8 and not keep_columns
-        if corrected:
+        if not keep_columns:
             image = with_columns_corrected(image, noise)
-        return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed, counts, corrected)
+        return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed, counts)
 
     def saturation(self) -> 'Saturation | None':
         """Where the gray scale of a picture for a display ends; None: nowhere, or raw counts."""
@@ -113,9 +111,7 @@ class Frame:
         assert self.received is not None
         image = counts_of_levels.astype(np.float32).take(self.received, mode='clip')
         noise = pixel_noise(image)
-        if self.corrected:
-            image = with_columns_corrected(image, noise)
-        return replace(self, image=image, noise=noise)
+        return replace(self, image=with_columns_corrected(image, noise), noise=noise)
 
 
 class Saturation(NamedTuple):
