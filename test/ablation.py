@@ -175,7 +175,7 @@ def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
     return _place('corners.squares:Squared')(seen, covariance, none, none, none)
 
 
-_READOUT = tuple(f'prediction.frame:{name}' for name in ('delays', 'stretch', 'displacement', 'rolling_displacement'))
+_READOUT = 'prediction.frame:delays', 'prediction.frame:rolling_displacement'
 _SCALES = _place('finding.search:SearchScales')
 _ALL_IN_THE_SEARCH = {'finding.finder:_next_scales': lambda *_, **__: _SCALES.ALL}
 _EVEN = {'corners.pattern_residuals:_beyond': lambda amounts, noise, _: np.zeros_like(noise)}

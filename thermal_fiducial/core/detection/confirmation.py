@@ -36,8 +36,6 @@ _MANY_BITS = 3
 # Range of the step from border to surroundings over the contrast: white surroundings are about as white as white bits,
 # the background behind a plate's edge is not.
 _WHITE = (0.4, 1.75)
-# Largest distance of a known marker from its prediction [cells].
-_NEAR_CELLS = 0.7
 # Distance from the image's border below which a marker, by its refined corners, counts as possibly cut off [px].
 _BORDER_PX = 1.0
 # Distance from the nearest view of a square beyond which an outline is no marker's, rms [cells]. Bent sheets in photos
@@ -97,8 +95,7 @@ def _are_confirmed(
     keep = ((off_cells < _LITTLE) & found.certain) | markers.observed.evident
     others = np.flatnonzero(~keep & ~markers.observed.refuted)
     if len(others):
-        near = found.expected[others] & (off_cells[others] < _NEAR_CELLS)
-        keep[others] = _readable(frame, markers.only(others), near, decoder, config)
+        keep[others] = _readable(frame, markers.only(others), found.expected[others], decoder, config)
     keep &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
     doubtful = np.flatnonzero(keep & (markers.observed.doubt > 0.0))
     if len(doubtful):
@@ -120,15 +117,15 @@ def _square(at: ImagePoints, variance: FloatArray, cells: int) -> BoolArray:
 
 
 def _readable(
-    frame: Frame, markers: RefinedMarkers, near: BoolArray, decoder: Decoder, config: ArucoDetectorConfig
+    frame: Frame, markers: RefinedMarkers, expected: BoolArray, decoder: Decoder, config: ArucoDetectorConfig
 ) -> BoolArray:
-    """Which markers (N,) are decoded at the refined corners; expected ones ``near`` (N,) need less evidence."""
+    """Which markers (N,) are decoded at the refined corners; ``expected`` ones (N,) need less evidence."""
     blur, corners = markers.blur, markers.observed.corners_px
     tails = None
     if blur.to_tails is not None:
         tails = corners @ blur.to_tails[:, :, :2].swapaxes(1, 2) + blur.to_tails[:, None, :, 2]
     reading = _read(frame.image, corners, tails, decoder)
-    known = near & reading.clear(config.guided_min_correlation, config.guided_min_margin)
+    known = expected & reading.clear(config.guided_min_correlation, config.guided_min_margin)
     still = np.sqrt(np.sum(blur.spread**2, axis=1)) < _LITTLE / decoder.cells * se3.sides_px(corners)
     clear = still & (frame.displayed | _sharp(markers.observed))
     similar = np.abs(reading.correlation) >= np.where(clear, _SIMILAR_IF_CLEAR, _SIMILAR)

@@ -37,7 +37,7 @@ from thermal_fiducial.core.detection.prediction.frame import (
     LEAST_DEPTH,
     motion_blur,
     Places,
-    removed_displacement,
+    REMAINING,
     rolling_displacement,
     Saturation,
 )
@@ -237,9 +237,8 @@ def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) 
         if frame.twist is None:
             return np.zeros((len(points), 2))
         places = places_of_points(points, frame.camera)
-        shift = places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
-        if to_tails is not None:
-            shift = shift - removed_displacement(places, frame.twist, frame)
+        left = 1.0 if to_tails is None else REMAINING
+        shift = left * places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
         return np.asarray(shift[0] / factor)
 
     saturation = None if to_tails is None else frame.saturation()

@@ -12,8 +12,7 @@ derivative makes a ghost of every step). Only the response older than a time m, 
 motion blur remains, which the edge model contains, and a known mean delay.
 
 With an acceleration a, the image of s ago lies s w - s^2 a / 2 behind. The mean delay of an exponential,
--tau w + tau^2 a, is therefore that of the velocity one time constant ago, and the lag tail is displaced by the velocity
-of tau + m / 2 ago.
+-tau w + tau^2 a, is therefore that of the velocity one time constant ago.
 """
 
 from dataclasses import dataclass, replace
@@ -52,8 +51,6 @@ _GAIN = 1.0 / (1.0 - _FORGOTTEN)
 #: Of an exponential response, those of the ages below m.
 REMAINING = 1.0 - _TAIL * _FORGOTTEN / (1.0 - _FORGOTTEN)
 SPREAD = math.sqrt(1.0 - _TAIL**2 * _FORGOTTEN / (1.0 - _FORGOTTEN) ** 2)
-#: Age, in time constants, of the velocity that gives the displacement of the lag tail.
-LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
 
 
 @dataclass(frozen=True)
@@ -159,12 +156,9 @@ class Places(Stacked):
         """Places of image points (N, 4) at ``depth`` (N, 4)."""
         return Places(at, depth, at.J @ interaction(at.x, depth))
 
-    def lag_blur(self, twist: Twist, lag: float, age: float = 1.0) -> FloatArray:
-        """Displacement (N, 4, 2) [px] of the corners in a ``lag`` [s] by the velocity ``age`` of its length ago.
-
-        The mean displacement; at ``LAG_TAIL_AGE`` that of the lag tail, over the tail's age in time constants.
-        """
-        return np.asarray(-lag * (self.flow @ twist.ago(age * lag)))
+    def lag_blur(self, twist: Twist, lag: float) -> FloatArray:
+        """Mean displacement (N, 4, 2) [px] of the corners in a ``lag`` [s]."""
+        return np.asarray(-lag * (self.flow @ twist.ago(lag)))
 
 
 def delays(rows: FloatArray, frame: Frame) -> FloatArray:
@@ -172,36 +166,22 @@ def delays(rows: FloatArray, frame: Frame) -> FloatArray:
     return frame.readout * (rows / (frame.camera.height - 1) - 0.5)
 
 
-def stretch(places: Places, twist: Twist, frame: Frame) -> FloatArray:
-    """Factor (N, 4) on displacements by the rolling shutter: above 1 for motion in the direction of the readout."""
-    velocity = places.flow @ twist.value
-    return np.asarray(1.0 / (1.0 - frame.readout / (frame.camera.height - 1) * velocity[..., 1]))
-
-
-def displacement(places: Places, twist: Twist, frame: Frame, seconds: FloatArray) -> FloatArray:
-    """Displacement (N, 4, 2) [px] of corners that are sampled ``seconds`` (N, 4) after the stamp.
-
-    A lagging image moves with the velocity of one time constant ago.
-    """
-    later = seconds[..., None]
-    middle = places.at.x + 0.5 * later * (interaction(places.at.x, places.depth) @ twist.value)
-    flow = Places.of(ImagePoints.seen_at(middle, frame.camera), places.depth).flow
-    return np.asarray(later * (flow @ twist.value - (frame.lag - 0.5 * later) * (flow @ twist.acceleration)))
-
-
 def rolling_displacement(
     places: Places, twist: Twist | None, frame: Frame, rows: FloatArray | None = None
 ) -> FloatArray:
     """Displacement (N, 4, 2) [px] by the rolling shutter.
 
-    ``rows`` (N, 4): in which the corners were observed; None: predicted, lag included.
+    ``rows`` (N, 4): in which the corners were observed; None: those that they are in at the stamp, lag included.
     """
     if frame.readout == 0.0 or twist is None:
         return np.zeros_like(places.at.px)
-    if rows is not None:
-        return displacement(places, twist, frame, delays(rows, frame))
-    lagging = places.at.px[..., 1] + places.lag_blur(twist, frame.lag)[..., 1]
-    return displacement(places, twist, frame, delays(lagging, frame) * stretch(places, twist, frame))
+    if rows is None:
+        rows = (places.at.px + places.lag_blur(twist, frame.lag))[..., 1]
+    later = delays(rows, frame)[..., None]
+    middle = places.at.x + 0.5 * later * (interaction(places.at.x, places.depth) @ twist.value)
+    flow = Places.of(ImagePoints.seen_at(middle, frame.camera), places.depth).flow
+    # A lagging image moves with the velocity of one time constant ago.
+    return np.asarray(later * (flow @ twist.value - (frame.lag - 0.5 * later) * (flow @ twist.acceleration)))
 
 
 def counts_of(pixel: IntArray, image: Float32Array, to_tails: FloatArray | None = None) -> Float32Array:
@@ -286,16 +266,6 @@ def motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlur
     mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
     if twist is None or (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
         return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean, lag_blur)
-    removed = removed_displacement(places, twist, frame)
-    shift = lag_blur - removed + rolling
-    to_tails = lag_tail_maps(places.at.px + shift, removed / (1.0 - REMAINING))
-    return MotionBlur(to_tails, shift, removed, SPREAD * mean, lag_blur)
-
-
-def removed_displacement(places: Places, twist: Twist, frame: Frame) -> FloatArray:
-    """Displacement (N, P, 2) by lag that vanishes with the lag tail [px]."""
-    # Displacement of the image since its lag tail was recorded, stretched by the rolling shutter.
-    tail = places.lag_blur(twist, frame.lag, LAG_TAIL_AGE)
-    if frame.readout > 0.0:
-        tail = tail * stretch(places, twist, frame)[..., None]
-    return (1.0 - REMAINING) * tail
+    shift = REMAINING * lag_blur + rolling
+    to_tails = lag_tail_maps(places.at.px + shift, lag_blur)
+    return MotionBlur(to_tails, shift, (1.0 - REMAINING) * lag_blur, SPREAD * mean, lag_blur)

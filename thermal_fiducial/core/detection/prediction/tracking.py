@@ -28,8 +28,6 @@ from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 _STALE_NS = 150_000_000
 # Jitter of the camera's stamps [s].
 _JITTER_S = 0.001
-# Standard deviation of the delay of corners in a lagging image before the twist is known [lag].
-_DELAY_UNSURE = 0.5
 # Number of coordinates of the corners of a marker.
 _COORDINATES = 8
 # Odometry that gives the twist of a frame: from 3 time constants of the lag before the frame to one after it, a window
@@ -103,11 +101,10 @@ class MotionTrack:
             return predicted
         begin, end = dt + (self.lag if self.twist is None else 0.0), self.lag if predicted is None else 0.0
         seconds, start = begin - end, predicted or UNKNOWN_TWIST
-        # Jitter of the stamps scales all velocities of a frame by a common factor.
-        unsure = 2.0 * _JITTER_S**2 + (0.0 if self.twist is not None else (_DELAY_UNSURE * self.lag) ** 2)
         A = interaction(0.5 * (x[now] + self.markers.x[before]), depth[now]).reshape(-1, 6)
         velocity = (x[now] - self.markers.x[before]).reshape(-1) / seconds
-        stretch = A @ (np.zeros(6) if predicted is None else math.sqrt(unsure) / seconds * predicted.value)
+        # Jitter of both stamps scales all velocities of a frame by a common factor.
+        stretch = A @ (math.sqrt(2.0) * _JITTER_S / seconds * start.value)
         weight = np.repeat((seconds / (1.5 * noise[now])) ** 2, _COORDINATES)
         # Weighted least squares whose residuals have one common error: the Sherman-Morrison formula.
         weighted, stretched = A.T * weight, weight * stretch
