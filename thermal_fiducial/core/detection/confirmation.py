@@ -15,7 +15,7 @@ from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorne
 from thermal_fiducial.core.detection.corners.refining import RefinedMarkers
 from thermal_fiducial.core.detection.finding.quads import halfway, halved
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
-from thermal_fiducial.core.detection.prediction.frame import Frame
+from thermal_fiducial.core.detection.prediction.frame import Frame, lag_tail_places
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
@@ -123,7 +123,7 @@ def _readable(
     blur, corners = markers.blur, markers.observed.corners_px
     tails = None
     if blur.to_tails is not None:
-        tails = corners @ blur.to_tails[:, :, :2].swapaxes(1, 2) + blur.to_tails[:, None, :, 2]
+        tails = lag_tail_places(corners.transpose(2, 0, 1), blur.to_tails).transpose(1, 2, 0)
     reading = _read(frame.image, corners, tails, decoder)
     known = expected & reading.clear(config.guided_min_correlation, config.guided_min_margin)
     still = np.sqrt(np.sum(blur.spread**2, axis=1)) < _LITTLE / decoder.cells * se3.sides_px(corners)

@@ -228,7 +228,7 @@ def test_what_a_display_saturates_is_no_count(cell, lag_blur, white, allowed):
         lag_tail_maps(corners + REMAINING * lag, lag),
         SPREAD * lag[:, 0],
     )
-    view = PatternView(frame.image, to_tails, spread, displayed=True, saturation=frame.saturation())
+    view = PatternView(frame.image, to_tails, spread, displayed=True, saturation=frame.saturation)
     near = int(nearness(there, decoder.cells, np.hypot(BLUR_PX, np.hypot(*spread.T)))[0])
     fit = fit_patterns(view, there + 0.5, MARKER, decoder, BLUR_PX, near)
     # When written 0.024, 0.018 and 0.106 px; where gray levels of what is saturated count, 0.125, 0.330 and 0.235 px.

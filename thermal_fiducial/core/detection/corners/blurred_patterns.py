@@ -166,30 +166,26 @@ class PatternView(NamedTuple):
         parts = {name: getattr(self, name) for name in names}
         return self._replace(**{name: part[which] for name, part in parts.items() if part is not None})
 
-    def values(self, quads: FloatArray, grid: PatternGrid) -> Float32Array:
-        """Values (Q, P) at the samples of markers in ``quads`` (Q, 4, 2)."""
-        places = self._places(quads, grid)
-        shown = self._at(places)
-        if self.to_tails is not None:
-            shown = without_tails(shown, self._at(lag_tail_places(places, self.to_tails)))
-            if self.saturation is not None:
-                shown = self.saturation.cut(shown)
-        return shown
-
-    def known(self, quads: FloatArray, grid: PatternGrid) -> BoolArray:
-        """Which samples (Q, P) of markers in ``quads`` (Q, 4, 2) are known."""
-        if self.saturation is None:
-            return np.ones((len(quads), grid.weights.shape[1]), dtype=np.bool_)
-        places = self._places(quads, grid)
-        if self.to_tails is None:
-            return np.asarray(self.saturation.at(places) == 0.0)
-        return self.saturation.known(places, lag_tail_places(places, self.to_tails))
-
-    def _places(self, quads: FloatArray, grid: PatternGrid) -> Float32Array:
+    def places(self, quads: FloatArray, grid: PatternGrid) -> tuple[Float32Array, Float32Array | None]:
+        """Places (2, Q, P) of the samples of markers in ``quads`` (Q, 4, 2), and of lag tails that are removed."""
         places = seen_between(quads, grid.weights)
         if self.bends is not None:
             places += (self.bends.astype(np.float32) @ grid.between_nodes).swapaxes(0, 1)
-        return places
+        return places, None if self.to_tails is None else lag_tail_places(places, self.to_tails)
+
+    def values(self, places: Float32Array, tails: Float32Array | None) -> Float32Array:
+        """Values (Q, P) at samples, by :meth:`places`."""
+        shown = self._at(places)
+        if tails is None:
+            return shown
+        shown = without_tails(shown, self._at(tails))
+        return shown if self.saturation is None else self.saturation.cut(shown)
+
+    def known(self, places: Float32Array, tails: Float32Array | None) -> BoolArray:
+        """Which samples (Q, P) are known, by :meth:`places`."""
+        if self.saturation is None:
+            return np.ones(places.shape[1:], dtype=np.bool_)
+        return np.asarray(self.saturation.at(places) == 0.0 if tails is None else self.saturation.known(places, tails))
 
     def _at(self, places: Float32Array) -> Float32Array:
         u, v = places

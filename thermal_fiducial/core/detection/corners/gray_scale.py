@@ -45,8 +45,6 @@ class GrayScale(NamedTuple):
 
     def differs(self, other: 'GrayScale') -> bool:
         """Whether other corners follow from another gray scale."""
-        if other is self:
-            return False
         counts, others = self.counts[self.shown], other.counts[self.shown]
         of_unit = np.stack([others, np.ones_like(others)], axis=1)
         change = counts - of_unit @ np.linalg.lstsq(of_unit, counts, rcond=None)[0]
@@ -67,10 +65,11 @@ class GrayScale(NamedTuple):
         to_cells = cells_by_pixels(corners_px, decoder.cells)
         model, spread = blurred(view, to_cells, np.full(len(ids), blur_px), white, grid)
         terms = np.concatenate(linear_terms(model, spread, grid, decoder.cells, displayed=False), axis=1)
-        known = view.known(corners_px, grid)
+        places = view.places(corners_px, grid)
+        known, gray = view.known(*places), view.values(*places)
         blank(terms, known)
         products = products_of(terms)
-        gray, pattern, apart_px = view.values(corners_px, grid), grid.patches(model.value), grid.apart_px(to_cells)
+        pattern, apart_px = grid.patches(model.value), grid.apart_px(to_cells)
         scale = self
         for _ in range(_ROUNDS):
             counts = np.interp(gray, _LEVELS, scale.counts).astype(np.float32)

@@ -130,7 +130,8 @@ class PatternResiduals(Stacked):
 
     def sample_at(self, view: PatternView, quads: FloatArray, which: IntArray) -> None:
         """Move ``which`` (W,) to corners ``quads`` (W, 4, 2) so near that the patterns on them stay."""
-        samples = _samples(view.only(which), quads, self.grid, self.known[which])
+        view = view.only(which)
+        samples = _samples(view.values(*view.places(quads, self.grid)), self.grid, self.known[which])
         uneven = self.unevenness and self.unevenness.only(which)
         terms, products = self.J[which, LINEAR], self.information[which, LINEAR, LINEAR]
         self.corners_px[which], self.samples[which] = quads, samples
@@ -162,8 +163,9 @@ def linearised(
     """The fit of ``white`` cells (Q, m, m), seen with ``blur`` (Q,) [px], at corners ``quads`` (Q, 4, 2)."""
     to_cells = cells_by_pixels(quads, white.shape[1])
     model, spread = blurred(view, to_cells, blur, white, grid)
-    known = view.known(quads, grid)
-    samples = _samples(view, quads, grid, known)
+    places = view.places(quads, grid)
+    known = view.known(*places)
+    samples = _samples(view.values(*places), grid, known)
     parts = linear_terms(model, spread, grid, white.shape[1], displayed=view.displayed)
     J = np.empty((len(quads), LINEAR.start + sum(part.shape[1] for part in parts), samples.shape[1]), dtype=np.float32)
     terms = np.concatenate(parts, axis=1, out=J[:, LINEAR])
@@ -198,9 +200,8 @@ def linearised(
     )
 
 
-def _samples(view: PatternView, quads: FloatArray, grid: PatternGrid, known: BoolArray) -> Float32Array:
-    """Values (Q, P) at the samples of markers in ``quads`` (Q, 4, 2), without background; 0 where not ``known``."""
-    values = view.values(quads, grid)
+def _samples(values: Float32Array, grid: PatternGrid, known: BoolArray) -> Float32Array:
+    """The ``values`` (Q, P) at samples without background; 0 where not ``known``."""
     # Small numbers for sums in single precision.
     samples = grid.without_background(values - values[:, :1])
     blank(samples[:, None], known)

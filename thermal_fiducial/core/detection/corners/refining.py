@@ -104,7 +104,7 @@ def refine(
         if bent:
             scale = _shown_scale(frame, scale, markers, start, decoder, config)
         change = np.abs(markers.corners.corners_px - refined.corners_px + blur.shift)
-        settled = change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX and not scale.differs(before)
+        settled = change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX and not (bent and scale.differs(before))
         if markers.twist is None or settled:
             break
         twist, places = markers.twist, markers.places
@@ -121,7 +121,7 @@ def _shown_scale(
 ) -> GrayScale:
     """The gray scale of the display that markers show, which were looked for at ``start`` (N, 4)."""
     bends = lens_bends(start, frame.camera)
-    view = PatternView(frame.image, lag=markers.blur.lag, bends=bends, saturation=frame.saturation())
+    view = PatternView(frame.image, lag=markers.blur.lag, bends=bends, saturation=frame.saturation)
     corners = markers.observed.corners_px + markers.blur.removed
     return before.shown_by(view, corners, markers.ids, decoder, config.blur_px)
 
@@ -169,7 +169,7 @@ def _by_patterns(
     near = nearness(start.px, decoder.cells, np.hypot(config.blur_px, np.hypot(*blur.spread.T)))
     refined = RefinedCorners.none()
     # At rest the model of a bent gray scale contains its ends.
-    saturation = None if blur.to_tails is None else frame.saturation()
+    saturation = None if blur.to_tails is None else frame.saturation
     for nearer in np.unique(near):
         which = near == nearer
         there, moving = start.only(which), blur.only(which)

@@ -241,7 +241,7 @@ def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) 
         shift = left * places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
         return np.asarray(shift[0] / factor)
 
-    saturation = None if to_tails is None else frame.saturation()
+    saturation = None if to_tails is None else frame.saturation
     return Layer(image, camera, displacement, blur, lag_blur, to_tails, saturation)
 
 

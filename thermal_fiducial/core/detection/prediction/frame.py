@@ -25,6 +25,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.prediction.twist import interaction, Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.se3 import Real
 from thermal_fiducial.core.pixel_noise import pixel_noise, with_columns_corrected
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
 
@@ -69,6 +70,8 @@ class Frame:
     readout: float
     #: whether it is a picture for a display, whose gain control is a nonlinear function of the counts
     displayed: bool = False
+    #: where its gray scale ends; None: nowhere, or raw counts
+    saturation: 'Saturation | None' = None
     #: (height, width) as received
     received: Counts | Gray | None = None
 
@@ -88,17 +91,8 @@ class Frame:
         image = counts.astype(np.float32)
         if not keep_columns:
             image = with_columns_corrected(image, noise)
-        return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed, counts)
-
-    def saturation(self) -> 'Saturation | None':
-        """Where the gray scale of a picture for a display ends; None: nowhere, or raw counts."""
-        if not self.displayed or self.received is None:
-            return None
-        black, white = self.received == 0, self.received == _LEVELS - 1
-        if not (black.any() or white.any()):
-            return None
-        low, high = self.image[black].max(initial=-np.inf), self.image[white].min(initial=np.inf)
-        return Saturation(np.subtract(white, black, dtype=np.float32), float(low), float(high))
+        saturation = Saturation.of(counts) if displayed else None
+        return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed, saturation, counts)
 
     def in_counts(self, counts_of_levels: FloatArray) -> 'Frame':
         """The frame with counts for the gray levels of a picture for a display, by those (256,) of each level.
@@ -107,8 +101,10 @@ class Frame:
         """
         assert self.received is not None
         image = counts_of_levels.astype(np.float32).take(self.received, mode='clip')
-        noise = pixel_noise(image)
-        return replace(self, image=with_columns_corrected(image, noise), noise=noise)
+        noise, saturation = pixel_noise(image), self.saturation
+        if saturation is not None:
+            saturation = saturation._replace(low=counts_of_levels[0], high=counts_of_levels[-1])
+        return replace(self, image=with_columns_corrected(image, noise), noise=noise, saturation=saturation)
 
 
 class Saturation(NamedTuple):
@@ -119,6 +115,14 @@ class Saturation(NamedTuple):
     #: counts of black and of white
     low: float
     high: float
+
+    @staticmethod
+    def of(levels: Counts | Gray) -> 'Saturation | None':
+        """Of a picture of gray ``levels`` (height, width); None: it is neither black nor white anywhere."""
+        black, white = levels == 0, levels == _LEVELS - 1
+        if not (black.any() or white.any()):
+            return None
+        return Saturation(np.subtract(white, black, dtype=np.float32), 0.0, _LEVELS - 1.0)
 
     def at(self, places: Float32Array) -> Float32Array:
         """Signs (...) at places (2, ...) in the image, 0 where no neighbour is saturated."""
@@ -221,10 +225,11 @@ def without_tails(counts: Float32Array, lag_tails: Float32Array) -> Float32Array
     return np.asarray(counts + np.float32(_GAIN - 1.0) * (counts - lag_tails))
 
 
-def lag_tail_places(places: Float32Array, to_tails: FloatArray) -> Float32Array:
+def lag_tail_places(places: Real, to_tails: FloatArray) -> Real:
     """Places (2, N, P) of the lag tails of ``places`` (2, N, P), by maps (N, 2, 3) of :func:`lag_tail_maps`."""
-    maps = to_tails.transpose(1, 2, 0)[..., None].astype(np.float32)
-    return np.asarray(maps[:, 0] * places[0] + maps[:, 1] * places[1] + maps[:, 2])
+    maps = to_tails.transpose(1, 2, 0)[..., None].astype(places.dtype)
+    tails: Real = maps[:, 0] * places[0] + maps[:, 1] * places[1] + maps[:, 2]
+    return tails
 
 
 def lag_tail_maps(corners_px: FloatArray, lag_blur_px: FloatArray) -> FloatArray:
