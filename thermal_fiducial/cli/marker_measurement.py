@@ -10,6 +10,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import narrow_sides
 from thermal_fiducial.core.measurements import columns, corners_px, Markers
 from thermal_fiducial.core.types import Counts, FloatArray, IntArray, SIGMA_OF_MEDIAN
 from thermal_fiducial.fabrication.planning import expected_errors, Measurements, pose_errors
@@ -103,7 +104,7 @@ def _with_narrowest_sides(lens: Lens, T: FloatArray, side_px: float) -> FloatArr
     """Poses (N, 4, 4) moved along the lines of sight to where the narrowest sides have ``side_px``."""
     T = T.copy()
     for _ in range(_STEPS):
-        T[:, :3, 3] *= se3.narrow_sides(_corners_px(lens, T))[:, None] / side_px
+        T[:, :3, 3] *= narrow_sides(_corners_px(lens, T))[:, None] / side_px
     return T
 
 

@@ -23,8 +23,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
-from thermal_fiducial.core.geometry.reprojection import marker_corners
-from thermal_fiducial.core.geometry.se3 import narrow_sides
+from thermal_fiducial.core.geometry.reprojection import marker_corners, narrow_sides
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.plain_yaml import load_plain

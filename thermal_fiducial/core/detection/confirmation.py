@@ -17,9 +17,9 @@ from thermal_fiducial.core.detection.finding.quads import halfway, halved
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
 from thermal_fiducial.core.detection.prediction.frame import Frame, lag_tail_places
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
-from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import planar_poses
+from thermal_fiducial.core.geometry.reprojection import narrow_sides, sides_px
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
 # Cells at least this wide are decoded at half resolution, with half the noise and less blur [px].
@@ -91,7 +91,7 @@ def _are_confirmed(
     """Which markers show their pattern at the refined corners, and are squares."""
     corners = markers.observed.corners_px
     there = found.places.at.px + markers.blur.shift
-    off_cells = np.abs(corners - there).max(axis=(1, 2)) * decoder.cells / se3.sides_px(there)
+    off_cells = np.abs(corners - there).max(axis=(1, 2)) * decoder.cells / sides_px(there)
     keep = ((off_cells < _LITTLE) & found.certain) | markers.observed.evident
     others = np.flatnonzero(~keep & ~markers.observed.refuted)
     if len(others):
@@ -112,7 +112,7 @@ def _square(at: ImagePoints, variance: FloatArray, cells: int) -> BoolArray:
     """
     count = len(at.px)
     poses = planar_poses(at, np.tile(np.eye(2), (count, 4, 1, 1)), np.ones(count))
-    off_square = _OFF_SQUARE_CELLS / cells * se3.sides_px(at.px)
+    off_square = _OFF_SQUARE_CELLS / cells * sides_px(at.px)
     return np.asarray(poses.rms_px[:, 0] ** 2 <= off_square**2 + _SIGMAS**2 * variance)
 
 
@@ -126,7 +126,7 @@ def _readable(
         tails = lag_tail_places(corners.transpose(2, 0, 1), blur.to_tails).transpose(1, 2, 0)
     reading = _read(frame.image, corners, tails, decoder)
     known = expected & reading.clear(config.guided_min_correlation, config.guided_min_margin)
-    still = np.sqrt(np.sum(blur.spread**2, axis=1)) < _LITTLE / decoder.cells * se3.sides_px(corners)
+    still = np.sqrt(np.sum(blur.spread**2, axis=1)) < _LITTLE / decoder.cells * sides_px(corners)
     clear = still & (frame.displayed | _sharp(markers.observed))
     similar = np.abs(reading.correlation) >= np.where(clear, _SIMILAR_IF_CLEAR, _SIMILAR)
     distinct = (similar | (decoder.correctable >= _MANY_BITS)) & _stands_out(reading, decoder)
@@ -140,7 +140,7 @@ def _sharp(refined: RefinedCorners) -> BoolArray:
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:
     """Readings of quadrilaterals (Q, 4, 2), at half resolution if all are large enough."""
-    if se3.narrow_sides(quads).min() < _WIDE_CELL_PX * decoder.cells:
+    if narrow_sides(quads).min() < _WIDE_CELL_PX * decoder.cells:
         return decoder.read(image, quads, lag_tails=lag_tails)
     half_tails = None if lag_tails is None else halfway(lag_tails)
     return decoder.read(halved(image), halfway(quads), lag_tails=half_tails)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.prediction.frame import without_tails
-from thermal_fiducial.core.geometry.se3 import bilinear, diagonals, seen_between
+from thermal_fiducial.core.geometry.reprojection import bilinear, diagonals, seen_between
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
 
 # Distance from a side at which black and white are compared: in cells, and at most in pixels.

@@ -11,7 +11,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, inverse_2x2
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners, whitening
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners, perspective, whitening
 from thermal_fiducial.core.geometry.rigid_fit import costs, evaluate, Images, minimise
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
@@ -220,7 +220,7 @@ def ippe_square(normalised: FloatArray, sizes: FloatArray) -> FloatArray:
 
 def _homography_derivative(c: FloatArray, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Derivative (N, 2, 2) [1/m] at, and image (N, 2) of, the centre under the homography of a square to ``c``."""
-    weight = se3.perspective(c)[..., None]
+    weight = perspective(c)[..., None]
     weight[np.abs(weight) <= TINY] = np.nan
     corners = np.concatenate([weight * c, weight], axis=-1)
     centre, right, up = 0.25 * corners.sum(axis=1), corners[:, 1] - corners[:, 0], corners[:, 0] - corners[:, 3]

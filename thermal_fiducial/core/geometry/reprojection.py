@@ -1,24 +1,29 @@
-"""Re-projection of map markers into a frame: errors that mapper, candidates and joint adjustment minimise.
+"""Markers as a camera sees them: re-projected corners, with derivatives, and quadrilaterals in an image.
 
 Poses are perturbed in the ROS convention of :mod:`thermal_fiducial.core.measurements`: ``d`` is (x y z, rotation
 about x y z), both in the map frame. With ``p_camera = R' (R_m c + t_m - t)`` for a corner ``c`` of the marker,
 ``dp_camera = R' (dt_m - [R_m c]x dr_m - dt + [R_m c + t_m - t]x dr)``.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from thermal_fiducial.core.geometry.se3 import apply, skew, so3_exp, so3_log
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
 
 if TYPE_CHECKING:
     # Not imported here: the filter uses this module, and restarts sooner without OpenCV.
     from thermal_fiducial.core.geometry.camera import Camera
 
+#: Numbers in either precision.
+Real = TypeVar('Real', FloatArray, Float32Array)
+
 #: Corners of a marker of side 2, clockwise from its top-left.
 _UNIT_CORNERS = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+# Of a corner of a quadrilateral, the next and the opposite one.
+_NEXT, _OPPOSITE = np.array([1, 2, 3, 0]), np.array([2, 3, 0, 1])
 
 
 def retract(T: npt.ArrayLike, d: npt.ArrayLike) -> FloatArray:
@@ -112,3 +117,74 @@ def whitening(covariances: FloatArray) -> FloatArray:
     W[..., 1, 0] = -b / (a * rest)
     W[..., 1, 1] = 1.0 / rest
     return W
+
+
+def bilinear(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Weights (..., 4, P) of a square's corners in its points at shares a, b (..., P)."""
+    return np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b], axis=-2)
+
+
+def seen_between(c: FloatArray, weights: Real) -> Real:
+    """Points (2, Q, P) that have ``weights`` (4, P) or (Q, 4, P) in a square, of its views with corners (Q, 4, 2).
+
+    In the precision of the weights.
+
+    In homogeneous coordinates, which leave straight what is straight, they are the same means of the corners (the
+    projective map of the unit square: P. Heckbert, "Fundamentals of texture mapping and image warping", 1989).
+    """
+    corners = np.empty((3, *c.shape[:2]))
+    corners[2] = perspective(c)
+    np.multiply(c.transpose(2, 0, 1), corners[2], out=corners[:2])
+    corners = corners.astype(weights.dtype, copy=False)
+    points = corners @ weights if weights.ndim == 2 else (corners[:, :, None] @ weights)[:, :, 0]
+    points[:2] /= points[2]
+    return points[:2]
+
+
+def squared_sides(quads: FloatArray) -> FloatArray:
+    """Squared lengths (Q, 4) of the sides of quadrilaterals (Q, 4, 2), from each corner to the next."""
+    to_next = quads.take(_NEXT, axis=1) - quads
+    return np.asarray((to_next * to_next).sum(axis=-1))
+
+
+def sides_px(quads: FloatArray) -> FloatArray:
+    """Mean sides (Q,) of quadrilaterals (Q, 4, 2)."""
+    return np.asarray(np.sqrt(squared_sides(quads)).mean(axis=1))
+
+
+def narrow_sides(quads: FloatArray) -> FloatArray:
+    """Narrowest sides (Q,) of quadrilaterals (Q, 4, 2)."""
+    return np.asarray(np.sqrt(squared_sides(quads).min(axis=1)))
+
+
+def widths(quads: FloatArray) -> FloatArray:
+    """Widths (Q,) of quadrilaterals (Q, 4, 2): their areas over their longest sides.
+
+    Of a square that is turned away about its diagonal all sides stay long, and the opposite ones come near.
+    """
+    (u, v), (w, z) = (quads[:, 2] - quads[:, 0]).T, (quads[:, 3] - quads[:, 1]).T
+    return np.asarray(0.5 * np.abs(u * z - v * w) / np.sqrt(squared_sides(quads).max(axis=1) + TINY))
+
+
+def diagonals(quads: FloatArray) -> FloatArray:
+    """Lengths (Q,) of the diagonals of quadrilaterals (Q, 4, 2) from their first corners."""
+    return np.asarray(np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1))
+
+
+def grown(quads: FloatArray, factor: float | FloatArray) -> FloatArray:
+    """Quadrilaterals (Q, 4, 2) scaled about their centres by a ``factor``, one for all or (Q, 1, 1)."""
+    middle = quads.mean(axis=1, keepdims=True)
+    return np.asarray(middle + factor * (quads - middle))
+
+
+def perspective(c: FloatArray) -> FloatArray:
+    """Depths (Q, 4) of the corners of squares by their views (Q, 4, 2), up to a factor; equal from in front.
+
+    The diagonals of a square halve each other, so the depth of a corner is proportional to the area of the triangle of
+    the other three.
+    """
+    to_next = c.take(_NEXT, axis=1) - c
+    a, b = to_next.take(_NEXT, axis=1), to_next.take(_OPPOSITE, axis=1)
+    triangle = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    triangle[np.abs(triangle) < TINY] = TINY
+    return np.asarray(triangle)

@@ -1,4 +1,4 @@
-"""Rotations and rigid transforms; squares as a camera sees them, quadrilaterals.
+"""Rotations and rigid transforms.
 
 ``T_a_b`` is 4x4 and maps coordinates in b to coordinates in a, ``p_a = T_a_b @ p_b``; inner names cancel.
 Rotation vectors are in radians. All functions accept leading batch dimensions unless they say otherwise.
@@ -8,23 +8,18 @@ robotics", 2018, appendices B and D.
 """
 
 import math
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
-
-#: Numbers in either precision.
-Real = TypeVar('Real', FloatArray, Float32Array)
+from thermal_fiducial.core.types import FloatArray, TINY
 
 # Below this angle [rad] the Taylor series is exact to double precision (the next term is angle^6 / 5040).
 SMALL_ANGLE = 1e-2
 #: (3, 9): vectors (..., 3) times this are their cross-product matrices, row by row.
 SKEW = np.array(((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0)), float)
 _EYE = np.eye(3)
-# Of a corner of a quadrilateral, the next and the opposite one.
-_NEXT, _OPPOSITE = np.array([1, 2, 3, 0]), np.array([2, 3, 0, 1])
 
 
 def skew(v: npt.ArrayLike) -> FloatArray:
@@ -196,74 +191,3 @@ def rotation_angle(R: npt.ArrayLike) -> FloatArray:
     x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
     return np.asarray(np.arctan2(np.sqrt(x * x + y * y + z * z), trace - 1.0))
-
-
-def bilinear(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Weights (..., 4, P) of a square's corners in its points at shares a, b (..., P)."""
-    return np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b], axis=-2)
-
-
-def seen_between(c: FloatArray, weights: Real) -> Real:
-    """Points (2, Q, P) that have ``weights`` (4, P) or (Q, 4, P) in a square, of its views with corners (Q, 4, 2).
-
-    In the precision of the weights.
-
-    In homogeneous coordinates, which leave straight what is straight, they are the same means of the corners (the
-    projective map of the unit square: P. Heckbert, "Fundamentals of texture mapping and image warping", 1989).
-    """
-    corners = np.empty((3, *c.shape[:2]))
-    corners[2] = perspective(c)
-    np.multiply(c.transpose(2, 0, 1), corners[2], out=corners[:2])
-    corners = corners.astype(weights.dtype, copy=False)
-    points = corners @ weights if weights.ndim == 2 else (corners[:, :, None] @ weights)[:, :, 0]
-    points[:2] /= points[2]
-    return points[:2]
-
-
-def squared_sides(quads: FloatArray) -> FloatArray:
-    """Squared lengths (Q, 4) of the sides of quadrilaterals (Q, 4, 2), from each corner to the next."""
-    to_next = quads.take(_NEXT, axis=1) - quads
-    return np.asarray((to_next * to_next).sum(axis=-1))
-
-
-def sides_px(quads: FloatArray) -> FloatArray:
-    """Mean sides (Q,) of quadrilaterals (Q, 4, 2)."""
-    return np.asarray(np.sqrt(squared_sides(quads)).mean(axis=1))
-
-
-def narrow_sides(quads: FloatArray) -> FloatArray:
-    """Narrowest sides (Q,) of quadrilaterals (Q, 4, 2)."""
-    return np.asarray(np.sqrt(squared_sides(quads).min(axis=1)))
-
-
-def widths(quads: FloatArray) -> FloatArray:
-    """Widths (Q,) of quadrilaterals (Q, 4, 2): their areas over their longest sides.
-
-    Of a square that is turned away about its diagonal all sides stay long, and the opposite ones come near.
-    """
-    (u, v), (w, z) = (quads[:, 2] - quads[:, 0]).T, (quads[:, 3] - quads[:, 1]).T
-    return np.asarray(0.5 * np.abs(u * z - v * w) / np.sqrt(squared_sides(quads).max(axis=1) + TINY))
-
-
-def diagonals(quads: FloatArray) -> FloatArray:
-    """Lengths (Q,) of the diagonals of quadrilaterals (Q, 4, 2) from their first corners."""
-    return np.asarray(np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1))
-
-
-def grown(quads: FloatArray, factor: float | FloatArray) -> FloatArray:
-    """Quadrilaterals (Q, 4, 2) scaled about their centres by a ``factor``, one for all or (Q, 1, 1)."""
-    middle = quads.mean(axis=1, keepdims=True)
-    return np.asarray(middle + factor * (quads - middle))
-
-
-def perspective(c: FloatArray) -> FloatArray:
-    """Depths (Q, 4) of the corners of squares by their views (Q, 4, 2), up to a factor; equal from in front.
-
-    The diagonals of a square halve each other, so the depth of a corner is proportional to the area of the triangle of
-    the other three.
-    """
-    to_next = c.take(_NEXT, axis=1) - c
-    a, b = to_next.take(_NEXT, axis=1), to_next.take(_OPPOSITE, axis=1)
-    triangle = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    triangle[np.abs(triangle) < TINY] = TINY
-    return np.asarray(triangle)

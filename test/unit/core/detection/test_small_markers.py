@@ -22,7 +22,7 @@ from thermal_fiducial.core.detection.corners.pattern_residuals import products_o
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.se3 import seen_between
+from thermal_fiducial.core.geometry.reprojection import seen_between
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
 from thermal_fiducial.files.dictionary import load_dictionary
 

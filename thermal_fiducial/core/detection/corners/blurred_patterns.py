@@ -23,7 +23,7 @@ import numpy as np
 
 from thermal_fiducial.core.detection.prediction.frame import lag_tail_places, Saturation, without_tails
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
+from thermal_fiducial.core.geometry.reprojection import bilinear, seen_between
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY
 
 # Place of the end of the warm surface outside the sides [cells].

@@ -40,7 +40,7 @@ from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.prediction.frame import Frame, MotionBlur
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry.camera import ImagePoints
-from thermal_fiducial.core.geometry.se3 import diagonals, sides_px, squared_sides, widths
+from thermal_fiducial.core.geometry.reprojection import diagonals, sides_px, squared_sides, widths
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY
 
 # Bound on the number of false markers in a picture, were all of it squares with a black border around random bits.

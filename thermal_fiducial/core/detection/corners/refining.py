@@ -37,7 +37,7 @@ from thermal_fiducial.core.detection.prediction.known_markers import FoundMarker
 from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
 from thermal_fiducial.core.detection.prediction.twist import Twist, UNKNOWN_TWIST
 from thermal_fiducial.core.geometry.camera import ImagePoints
-from thermal_fiducial.core.geometry.se3 import sides_px
+from thermal_fiducial.core.geometry.reprojection import sides_px
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked, TINY
 
 #: Contrast-to-noise ratio above which a marker is clear: it is found at full and at half resolution.

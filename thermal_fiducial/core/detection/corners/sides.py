@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import perspective
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Corners between which the sides lie: top and bottom from left to right, left and right from the top down.
@@ -93,7 +93,7 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, 
     columns : C in each of them
     blur_px : the widest: columns have pixels as far as it reaches on either side
     """
-    weight = se3.perspective(x)
+    weight = perspective(x)
     start, end = x.take(STARTS, axis=1), x.take(ENDS, axis=1)
     ratio = (weight.take(ENDS, axis=1) / weight.take(STARTS, axis=1))[..., None]
     share = NODES * ratio / (1.0 + NODES * (ratio - 1.0))

@@ -12,8 +12,8 @@ import numpy as np
 
 from thermal_fiducial.core.geometry.camera import ImagePoints, inverse_2x2
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
-from thermal_fiducial.core.geometry.reprojection import marker_corners
-from thermal_fiducial.core.geometry.se3 import apply, perspective
+from thermal_fiducial.core.geometry.reprojection import marker_corners, perspective
+from thermal_fiducial.core.geometry.se3 import apply
 from thermal_fiducial.core.types import FloatArray
 
 # Standard deviation of the two constraints, by the cut of markers and by lens calibrations.

@@ -27,7 +27,7 @@ from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
 from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
-from thermal_fiducial.core.geometry.se3 import diagonals
+from thermal_fiducial.core.geometry.reprojection import diagonals
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS
 
 # Polarity: memory in frames that show markers, and the surplus of markers of one polarity from which on it is certain.

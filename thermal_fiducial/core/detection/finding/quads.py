@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.geometry.se3 import grown, squared_sides
+from thermal_fiducial.core.geometry.reprojection import grown, squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, TINY
 
 # Window of the local standard deviation, at a quarter of the resolution: 68 px, a marker at working distance.

@@ -18,7 +18,7 @@ from thermal_fiducial.core.detection.finding.quads import (
 from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
 from thermal_fiducial.core.detection.prediction.frame import Frame
 from thermal_fiducial.core.detection.prediction.known_markers import among, CUT_OFF_PX, FoundMarkers, TOGETHER
-from thermal_fiducial.core.geometry.se3 import diagonals, grown, sides_px, squared_sides
+from thermal_fiducial.core.geometry.reprojection import diagonals, grown, sides_px, squared_sides
 from thermal_fiducial.core.pixel_noise import with_columns_corrected
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 

@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.core.detection.prediction.frame import LEAST_DEPTH, Places
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, diagonals, marker_corners, squared_sides
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
 
 #: Distance from the image's border [px] below which an unrefined marker counts as possibly cut off.
@@ -83,7 +83,7 @@ class FoundMarkers(Stacked):
         if len(others.ids) == 0:
             return self
         apart = np.linalg.norm(others.places.at.px.mean(axis=1)[:, None] - self.places.at.px.mean(axis=1), axis=-1)
-        extent = se3.diagonals(self.places.at.px)
+        extent = diagonals(self.places.at.px)
         return self.joined(others.only(~among(others.ids, self.ids) & (apart > TOGETHER * extent).all(axis=1)))
 
 
@@ -137,7 +137,7 @@ class KnownMarkers:
         rotated = self._corners_and_normals @ T_camera_map[:3, :3].T
         points, normal = rotated[:, :4] + T_camera_map[:3, 3], rotated[:, 4]
         corners = camera.project(points)
-        large = (se3.squared_sides(corners) >= min_side_px**2).all(axis=1)
+        large = (squared_sides(corners) >= min_side_px**2).all(axis=1)
         in_view = camera.contains(corners, CUT_OFF_PX).all(axis=1)
         visible = np.flatnonzero(in_view & large & _faces_camera(points.mean(axis=1), normal))
         points = points[visible]
