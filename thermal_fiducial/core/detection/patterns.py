@@ -12,12 +12,11 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.prediction.frame import without_tails
-from thermal_fiducial.core.geometry.reprojection import bilinear, diagonals, seen_between
+from thermal_fiducial.core.geometry.reprojection import bilinear, seen_between
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
 
-# Distance from a side at which black and white are compared: in cells, and at most in pixels.
+# Distance from a side at which black and white are compared [cells].
 _OUTSIDE = 0.4
-_OUTSIDE_PX = 2.5
 #: Largest number of rows, or of columns, of places that OpenCV interpolates at once.
 MOST_AT_ONCE = 2**15 - 2
 # Correlation below which the surroundings need not be measured.
@@ -134,7 +133,7 @@ class Decoder:
         self._patterns = patterns.astype(np.float32)
         share = ((np.arange(self.cells)[:, None] + CELL_SAMPLES) / self.cells).ravel()
         self._samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share))).astype(np.float32)
-        self._along_sides, self._away = _beside_sides(self.cells)
+        self._beside_sides = _beside_sides(self.cells)
         mean = np.kron(np.eye(self.cells), np.full((len(CELL_SAMPLES), 1), 1.0 / len(CELL_SAMPLES)))
         self._cells_of_samples = (np.kron(mean, mean) @ self._detrend).astype(np.float32)
 
@@ -218,12 +217,9 @@ class Decoder:
 
     def _steps(self, image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None) -> FloatArray:
         """Mean counts just outside the sides minus those just inside (Q, 4)."""
-        side = diagonals(quads) / np.sqrt(2.0)
-        near = np.minimum(_OUTSIDE / self.cells, _OUTSIDE_PX / np.maximum(side, 1.0))[:, None, None]
-        weights = self._along_sides + near.astype(np.float32) * self._away
-        counts = sampled(image, seen_between(quads, weights))
+        counts = sampled(image, seen_between(quads, self._beside_sides))
         if lag_tails is not None:
-            counts = without_tails(counts, sampled(image, seen_between(lag_tails, weights)))
+            counts = without_tails(counts, sampled(image, seen_between(lag_tails, self._beside_sides)))
         means = counts.reshape(len(quads), 2, 4, -1).mean(axis=-1)
         return np.asarray(means[:, 0] - means[:, 1], dtype=np.float64)
 
@@ -238,13 +234,13 @@ def shrunk(quads: FloatArray, cells: int, margin: float) -> FloatArray:
     return seen_between(quads, _in_plate(cells, margin)).transpose(1, 2, 0)
 
 
-def _beside_sides(cells: int) -> tuple[Float32Array, Float32Array]:
-    """Of :func:`bilinear`, (4, 8 m): places along the sides, and how they move outward, then inward, with distance."""
-    t, low, high = (np.arange(cells) + 0.5) / cells, np.zeros(cells), np.ones(cells)
-    a, b = np.concatenate([t, t, low, high]), np.concatenate([low, high, t, t])
-    outward = bilinear(a + (a == 1.0) - (a == 0.0), b + (b == 1.0) - (b == 0.0)) - bilinear(a, b)
-    at, away = np.tile(bilinear(a, b), 2), np.concatenate([outward, -outward], axis=-1)
-    return at.astype(np.float32), away.astype(np.float32)
+def _beside_sides(cells: int) -> Float32Array:
+    """Of :func:`bilinear`, (4, 8 m): places just outside the sides, then just inside."""
+    t, apart, parts = (np.arange(cells) + 0.5) / cells, _OUTSIDE / cells, []
+    for before, behind in ((-apart, 1.0 + apart), (apart, 1.0 - apart)):
+        low, high = np.full(cells, before), np.full(cells, behind)
+        parts.append(bilinear(np.concatenate([t, t, low, high]), np.concatenate([low, high, t, t])))
+    return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
 @cache

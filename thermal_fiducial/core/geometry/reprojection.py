@@ -125,7 +125,7 @@ def bilinear(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def seen_between(c: FloatArray, weights: Real) -> Real:
-    """Points (2, Q, P) that have ``weights`` (4, P) or (Q, 4, P) in a square, of its views with corners (Q, 4, 2).
+    """Points (2, Q, P) that have ``weights`` (4, P) in a square, of its views with corners (Q, 4, 2).
 
     In the precision of the weights.
 
@@ -136,7 +136,7 @@ def seen_between(c: FloatArray, weights: Real) -> Real:
     corners[2] = perspective(c)
     np.multiply(c.transpose(2, 0, 1), corners[2], out=corners[:2])
     corners = corners.astype(weights.dtype, copy=False)
-    points = corners @ weights if weights.ndim == 2 else (corners[:, :, None] @ weights)[:, :, 0]
+    points = corners @ weights
     points[:2] /= points[2]
     return points[:2]
 
