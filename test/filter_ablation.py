@@ -73,8 +73,8 @@ MECHANISMS = {
     ),
     'change of the error of the map': Mechanism(
         ('map in the making',),
-        ('pose_noise:BodyPose.map_change',),
-        {'pose_noise:BodyPose.map_change': lambda *_: 0.0},
+        ('pose_noise:BodyPose.map_correlation', 'update:_with_markers'),
+        {'update:_with_markers': lambda estimate, _: estimate},
     ),
     'smaller error of the map': Mechanism(
         ('map in the making',),

@@ -60,6 +60,7 @@ def blank_state(config: PoseEkfConfig) -> NavigationState:
         time_offset=0.0,
         T_body_camera=camera_in_body(config),
         systematic=np.zeros(6),
+        T_map_markers=np.eye(4),
     )
 
 
@@ -92,6 +93,7 @@ def start(
         position=pose.T_map_body[:3, 3],
         velocity=np.zeros(3),
         systematic=np.zeros(6),
+        T_map_markers=np.eye(4),
     )
     if config.estimate_time_offset:
         P += _of_unknown_clock(config, state, imu[-1])
@@ -113,7 +115,7 @@ def no_gravity(imu: FloatArray) -> Condition:
 
 
 def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatArray) -> FloatArray:
-    """Covariance (48, 48) by an unknown clock offset s; ``imu`` (6,) is the latest sample.
+    """Covariance (54, 54) by an unknown clock offset s; ``imu`` (6,) is the latest sample.
 
     The first pose measures the state at the camera's stamp, X(t + s) = X(t) Exp(derivative s).
     """
@@ -125,7 +127,7 @@ def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatA
 
 
 def _initial_variances(config: PoseEkfConfig) -> FloatArray:
-    """(48,) prior variances of all that the first pose does not measure."""
+    """(54,) prior variances of all that the first pose does not measure."""
     stds = np.zeros(SIZE)
     stds[VELOCITY] = config.initial_velocity_std
     stds[GYROSCOPE_BIAS] = config.initial_gyroscope_bias_std

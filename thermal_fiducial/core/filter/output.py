@@ -52,7 +52,8 @@ def odometry(estimate: Estimate, contradicting: OtherEstimate | None, sample: La
     J[6:9, ROTATION] = skew(velocity_body)
     covariance = J @ joint @ J.T
     covariance.reshape(-1)[_RATE_VARIANCES] += float(sample.densities[0]) ** 2 / sample.seconds
-    of_map = estimate.pose_noise.last.map_covariance
+    to_robot = lever_arm(state.position)
+    of_map = to_robot @ estimate.pose_noise.last.map_covariance @ to_robot.T
     return Odometry(
         estimate.stamp_ns,
         state.T_map_body,

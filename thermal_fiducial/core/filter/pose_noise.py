@@ -16,6 +16,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.geometry.plausibility import LEAST_INDEPENDENT
+from thermal_fiducial.core.geometry.reprojection import lever_arm
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.types import FloatArray
 
@@ -41,7 +42,7 @@ class BodyPose:
     T_map_body: FloatArray
     #: (6, 6) relative to the map, its error left out: rotation, then position, in the robot frame [rad, m]
     covariance: FloatArray
-    #: (6, 6) due to errors of the map: ROS convention, in ``map`` [m, rad]
+    #: (6, 6) of the motion of the map, about its origin, that its errors are: position, then rotation [m, rad]
     map_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @cached_property
@@ -50,9 +51,11 @@ class BodyPose:
         return self.covariance + _ROUNDING
 
     @cached_property
-    def of_map(self) -> FloatArray:
-        """(6, 6) ``map_covariance`` in the conventions of ``covariance``."""
-        return self._in_robot_frame(self.map_covariance)
+    def by_map(self) -> FloatArray:
+        """(6, 6) its derivative by a motion of the map about its origin, in the conventions of ``covariance``."""
+        turn = np.zeros((6, 6))
+        turn[:3, 3:] = turn[3:, :3] = self.T_map_body[:3, :3].T
+        return turn @ lever_arm(self.T_map_body[:3, 3])
 
     def seen_from(self, T_map_body: FloatArray) -> 'BodyPose':
         """It with ``T_map_body`` of an estimate, which shows better than a noisy pose how the view changes."""
@@ -72,15 +75,15 @@ class BodyPose:
         moved = float(np.linalg.norm(T[:3, 3] - T_last[:3, 3])) / distance
         return math.exp(-(turned + moved) / angle + log_overlap(last.shape, self.shape))
 
-    def map_change(self, last: 'BodyPose') -> float:
-        """Share, 0 to 1, of the map's error that is another one than in the ``last`` pose.
+    def map_correlation(self, last: 'BodyPose') -> float:
+        """Correlation, 0 to 1, of the map's errors of this pose and of the ``last`` one.
 
-        The same markers in the same map have the same error. The overlap of the two covariances is the correlation.
+        The same markers in the same map have the same error. It falls with the overlap of the two covariances.
         """
         if not (self.map_covariance.any() or last.map_covariance.any()):
-            return 0.0
-        then, now = self._in_robot_frame(last.map_covariance), self.of_map
-        return 1.0 - math.exp(2.0 * log_overlap(then + self.shape, now + self.shape))
+            return 1.0
+        then, now = self._of_map(last), self._of_map(self)
+        return math.exp(log_overlap(then + self.shape, now + self.shape))
 
     def map_error_left(self, last: 'BodyPose') -> FloatArray:
         """Covariance (6, 6), conventions of ``covariance``, by which the map's error of the ``last`` pose was larger.
@@ -88,16 +91,15 @@ class BodyPose:
         An estimate made from the last pose is off by that relative to the markers of this one, as far as their errors
         are not common to both.
         """
-        then, now = self._in_robot_frame(last.map_covariance), self.of_map
+        then, now = self._of_map(last), self._of_map(self)
         to_units = np.linalg.inv(np.linalg.cholesky(now + self.shape))
         variances, axes = np.linalg.eigh(to_units @ (then - now) @ to_units.T)
         roots = np.linalg.solve(to_units, axes * np.sqrt(np.maximum(variances, 0.0)))
         return np.asarray(roots @ roots.T)
 
-    def _in_robot_frame(self, map_covariance: FloatArray) -> FloatArray:
-        turn = np.zeros((6, 6))
-        turn[:3, 3:] = turn[3:, :3] = self.T_map_body[:3, :3].T
-        return turn @ map_covariance @ turn.T
+    def _of_map(self, pose: 'BodyPose') -> FloatArray:
+        """What the map's error of a ``pose`` makes of this one: covariance (6, 6)."""
+        return np.asarray(self.by_map @ pose.map_covariance @ self.by_map.T)
 
 
 def log_overlap(A: FloatArray, B: FloatArray) -> float:

@@ -80,7 +80,7 @@ def step_matrices(imu: FloatArray, seconds: FloatArray) -> StepMatrices:
 
 
 def random_walks(config: PoseEkfConfig) -> FloatArray:
-    """Squared densities (48,) of the random walks of the parameters."""
+    """Squared densities (54,) of the random walks of the parameters."""
     walks = np.zeros(SIZE)
     walks[GYROSCOPE_BIAS] = config.imu.gyroscope_random_walk
     walks[ACCELEROMETER_BIAS] = config.imu.accelerometer_random_walk
@@ -89,7 +89,7 @@ def random_walks(config: PoseEkfConfig) -> FloatArray:
 
 
 def propagated(estimate: Estimate, steps: Steps, stamp_ns: int, walks: FloatArray) -> Estimate:
-    """The estimate after ``steps`` that end at ``stamp_ns``; ``walks`` (48,) of :func:`random_walks`."""
+    """The estimate after ``steps`` that end at ``stamp_ns``; ``walks`` (54,) of :func:`random_walks`."""
     state = estimate.state
     imu = state.corrected(steps.imu)
     matrices = step_matrices(imu, steps.seconds)
@@ -157,7 +157,7 @@ def hovered(estimate: Estimate, densities: FloatArray, walks: FloatArray, second
     Parameters
     ----------
     densities : (6,) noise of gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]
-    walks : (48,) of :func:`random_walks`
+    walks : (54,) of :func:`random_walks`
     """
     if seconds == 0.0:
         return estimate

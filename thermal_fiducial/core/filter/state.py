@@ -15,7 +15,8 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
-from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian, transform
+from thermal_fiducial.core.geometry.reprojection import lever_arm
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_left_jacobian, transform
 from thermal_fiducial.core.types import FloatArray
 
 #: Error coordinates by index. Core, expressed in the robot frame [rad, m/s, m],
@@ -30,9 +31,11 @@ GRAVITY = slice(33, 35)
 TIME_OFFSET = 35
 #: T_body_camera, perturbed from the left [rad, m]; a consider parameter unless ``estimate_extrinsics``,
 EXTRINSICS = slice(36, 42)
-#: systematic error of the camera poses, in the robot frame [rad, m]
+#: systematic error of the camera poses, which lasts as long as the view, in the robot frame [rad, m],
 SYSTEMATIC = slice(42, 48)
-SIZE = 48
+#: T_map_markers, perturbed from the left [m, rad]: how the map's error of the poses has changed with their markers.
+MARKERS = slice(48, 54)
+SIZE = 54
 #: Coordinates that an IMU step propagates, and coordinates that they are propagated from.
 CORE, MOVED_BY = slice(0, 9), slice(0, 35)
 #: Core and bias of the gyroscope, whose errors those of the published odometry are.
@@ -63,6 +66,8 @@ class NavigationState:
     T_body_camera: FloatArray
     #: (6,) systematic error of the camera poses, in the robot frame [rad, m]
     systematic: FloatArray
+    #: (4, 4) the map as the markers of the last pose have it, in the map that the estimate is in
+    T_map_markers: FloatArray
 
     @property
     def T_map_body(self) -> FloatArray:
@@ -97,7 +102,7 @@ class NavigationState:
         )
 
     def plus(self, error: FloatArray) -> 'NavigationState':
-        """The state corrected by ``error`` (48,): X Exp(xi) for the group part, a sum for the rest."""
+        """The state corrected by ``error`` (54,): X Exp(xi) for the group part, a sum for the rest."""
         T_body_camera = self.T_body_camera
         if error[EXTRINSICS].any():
             turn, shift = error[EXTRINSICS][:3], error[EXTRINSICS][3:]
@@ -110,6 +115,7 @@ class NavigationState:
             time_offset=self.time_offset + float(error[TIME_OFFSET]),
             T_body_camera=T_body_camera,
             systematic=self.systematic + error[SYSTEMATIC],
+            T_map_markers=moved_map(error[MARKERS]) @ self.T_map_markers,
         )
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'NavigationState':
@@ -117,6 +123,7 @@ class NavigationState:
         R = T_new_old[:3, :3]
         return replace(
             self,
+            T_map_markers=T_new_old @ self.T_map_markers @ inverse(T_new_old),
             R_map_body=orthonormal(R @ self.R_map_body),
             velocity=R @ self.velocity,
             position=R @ self.position + T_new_old[:3, 3],
@@ -126,7 +133,7 @@ class NavigationState:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """State and covariance (48, 48) of its error at an instant in the clock of the IMU."""
+    """State and covariance (54, 54) of its error at an instant in the clock of the IMU."""
 
     stamp_ns: int
     state: NavigationState
@@ -169,19 +176,25 @@ class Estimate:
     @property
     def position_std(self) -> float:
         """Root of the sum of the position variances, the map's error included [m]."""
-        of_map = self.pose_noise.last.map_covariance[:3, :3]
+        to_robot = lever_arm(self.state.position)[:3]
+        of_map = to_robot @ self.pose_noise.last.map_covariance @ to_robot.T
         return math.hypot(self.std(POSITION), math.sqrt(float(of_map.trace())))
 
 
+def moved_map(motion: FloatArray) -> FloatArray:
+    """T_new_old (4, 4) by a motion (6,) of the map: position and rotation about its origin [m, rad]."""
+    return transform(so3_exp(motion[3:]), motion[:3])
+
+
 def embedded_core(error: FloatArray) -> FloatArray:
-    """Error coordinates (48,) with the given core (9,), zero elsewhere."""
+    """Error coordinates (54,) with the given core (9,), zero elsewhere."""
     whole = np.zeros(SIZE)
     whole[CORE] = error
     return whole
 
 
 def clock_offset_derivative(derivative: FloatArray) -> FloatArray:
-    """(48,) error by 1 s of clock offset with which the state at the camera's stamps is right.
+    """(54,) error by 1 s of clock offset with which the state at the camera's stamps is right.
 
     ``derivative`` (9,): of the core, :meth:`NavigationState.derivative`.
     """

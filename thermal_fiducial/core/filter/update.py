@@ -17,6 +17,8 @@ from thermal_fiducial.core.filter.state import (
     Estimate,
     EXTRINSICS,
     GRAVITY,
+    MARKERS,
+    moved_map,
     NavigationState,
     POSE,
     POSITION,
@@ -52,7 +54,7 @@ class Innovation(NamedTuple):
     derivative: FloatArray
     #: (3, 6, 6) covariances of the innovation by white errors of variance 1, in the order of :class:`PoseNoise`
     units: FloatArray
-    #: (6,) the innovation, its covariance S (6, 6) and the inverse, Jacobian H (6, 48), measurement noise R (6, 6)
+    #: (6,) the innovation, its covariance S (6, 6) and the inverse, Jacobian H (6, 54), measurement noise R (6, 6)
     value: FloatArray
     S: FloatArray
     S_inverse: FloatArray
@@ -75,8 +77,8 @@ def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> Body
     J[:3, 3:] = J[3:, :3] = R.T
     J[3:, 3:] = -R.T @ skew(lever)
     relative = scale**2 * (J @ (pose.covariance - pose.map_covariance) @ J.T)
-    to_body = lever_arm(lever)
-    return BodyPose(T_map_body, relative, to_body @ pose.map_covariance @ to_body.T)
+    to_origin = lever_arm(-pose.T_map_camera[:3, 3])
+    return BodyPose(T_map_body, relative, to_origin @ pose.map_covariance @ to_origin.T)
 
 
 def pose_error(state: NavigationState, T_map_body: FloatArray) -> FloatArray:
@@ -86,13 +88,18 @@ def pose_error(state: NavigationState, T_map_body: FloatArray) -> FloatArray:
     return np.concatenate((rotation, np.linalg.solve(so3_left_jacobian(rotation), offset)))
 
 
+def _unexplained(state: NavigationState, pose: BodyPose) -> FloatArray:
+    """(6,) :func:`pose_error` of a measured pose without the errors that the ``state`` has of it."""
+    return pose_error(state, inverse(state.T_map_markers) @ pose.T_map_body) - state.systematic
+
+
 def mount_jacobian(state: NavigationState) -> FloatArray:
     """(6, 3) derivative of a measured pose by a rotation of the camera against the robot, about the camera [rad]."""
     return np.vstack((np.eye(3), skew(state.T_body_camera[:3, 3])))
 
 
 def map_jacobian(state: NavigationState) -> FloatArray:
-    """(48, 6) derivative of the state by a motion of the map: rotation and position in the robot frame [rad, m]."""
+    """(54, 6) derivative of the state by a motion of the map: rotation and position in the robot frame [rad, m]."""
     J = np.zeros((SIZE, 6))
     J[POSE] = np.eye(6)
     J[VELOCITY, :3] = -skew(state.velocity_body)
@@ -107,6 +114,7 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
     H = np.zeros((6, SIZE))
     H[_SIX, POSE] = 1.0
     H[:, EXTRINSICS] = H[:, SYSTEMATIC] = np.eye(6)
+    H[:, MARKERS] = pose.seen_from(prior.state.T_map_markers @ prior.state.T_map_body).by_map
     mount = mount_jacobian(prior.state)
     jitter = np.outer(derivative[POSE], derivative[POSE])
     units = np.stack((pose.shape, jitter, mount @ mount.T))
@@ -116,14 +124,14 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
         R += _second_order_of_clock(prior, motion, derivative)
     else:
         R += config.time_offset_std**2 * jitter
-    value = pose_error(prior.state, pose.T_map_body) - prior.state.systematic
+    value = _unexplained(prior.state, pose)
     S = H @ prior.covariance @ H.T + R
     S_inverse = np.asarray(np.linalg.inv(S))
     return Innovation(estimate, pose, motion, prior, derivative, units, value, S, S_inverse, H, R)
 
 
 def with_covariance(config: PoseEkfConfig, innovation: Innovation, covariance: FloatArray) -> Innovation:
-    """The innovation if the covariance (48, 48) of the estimate were another one."""
+    """The innovation if the covariance (54, 54) of the estimate were another one."""
     estimate = replace(innovation.estimate, covariance=covariance)
     return innovation_of(config, estimate, innovation.pose, innovation.motion)
 
@@ -147,7 +155,7 @@ def adapted_noise(innovation: Innovation) -> PoseNoise:
 
 
 def with_unknown_clock(config: PoseEkfConfig, covariance: FloatArray) -> FloatArray:
-    """Covariance (48, 48) with a clock offset as uncertain as after a step of the camera's clock; all else stays."""
+    """Covariance (54, 54) with a clock offset as uncertain as after a step of the camera's clock; all else stays."""
     covariance = covariance.copy()
     covariance[TIME_OFFSET], covariance[:, TIME_OFFSET] = 0.0, 0.0
     covariance[TIME_OFFSET, TIME_OFFSET] = (2.0 * config.time_offset_std) ** 2
@@ -160,21 +168,31 @@ def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estim
     alike = pose.seen_from(estimate.state.T_map_body).correlation(last, config.systematic_angle)
     share = estimate.pose_noise.lasting
     of_view = share * config.systematic_pose_std**2 * pose.shape
-    # Changes of the map's error are in the systematic error too.
-    most = of_view + pose.of_map
     P = estimate.covariance.copy()
-    other_map = pose.map_change(last)
-    if other_map > 0.0:
-        moved = map_jacobian(estimate.state)
-        P += other_map * moved @ pose.map_error_left(last) @ moved.T
-    stays = share_that_stays(P[SYSTEMATIC, SYSTEMATIC], most)
+    stays = share_that_stays(P[SYSTEMATIC, SYSTEMATIC], of_view)
     kept = alike * stays
     P[SYSTEMATIC] = kept @ P[SYSTEMATIC]
     P[:, SYSTEMATIC] = P[:, SYSTEMATIC] @ kept.T
-    P[SYSTEMATIC, SYSTEMATIC] += (1.0 - alike**2) * of_view + alike**2 * (most - stays @ most)
-    P[SYSTEMATIC, SYSTEMATIC] += other_map * pose.of_map
+    P[SYSTEMATIC, SYSTEMATIC] += of_view - alike**2 * stays @ of_view
     state = replace(estimate.state, systematic=kept @ estimate.state.systematic)
-    return replace(estimate, state=state, covariance=P)
+    return _with_markers(replace(estimate, state=state, covariance=P), pose)
+
+
+def _with_markers(estimate: Estimate, pose: BodyPose) -> Estimate:
+    """The estimate with the map's error propagated to the markers of ``pose``: first-order Markov."""
+    last = estimate.pose_noise.last
+    alike = pose.map_correlation(last)
+    if alike == 1.0:
+        return estimate
+    P, state = estimate.covariance.copy(), estimate.state
+    moved = map_jacobian(state)
+    P += (1.0 - alike**2) * moved @ pose.map_error_left(last) @ moved.T
+    P[MARKERS] *= alike
+    P[:, MARKERS] *= alike
+    P[MARKERS, MARKERS] += (1.0 - alike**2) * pose.map_covariance
+    T = state.T_map_markers
+    kept = moved_map(alike * np.concatenate((T[:3, 3], so3_log(T[:3, :3]))))
+    return replace(estimate, state=replace(state, T_map_markers=kept), covariance=P)
 
 
 def _second_order_of_clock(prior: Estimate, motion: MotionAtPose, derivative: FloatArray) -> FloatArray:
@@ -218,7 +236,7 @@ def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, inno
 
 
 def _gained(config: PoseEkfConfig, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
-    """Kalman update: the corrected error (48,) and the covariance (48, 48)."""
+    """Kalman update: the corrected error (54,) and the covariance (54, 54)."""
     algebra, P = copy(_ALGEBRA), innovation.prior.covariance
     algebra.x, algebra.P = np.zeros(SIZE), P
     algebra.update(innovation.value, lambda _: innovation.H, lambda _: np.zeros(6), R=innovation.R)
@@ -231,12 +249,13 @@ def _gained(config: PoseEkfConfig, innovation: Innovation) -> tuple[FloatArray, 
 
 
 def _iterated(innovation: Innovation, gain: FloatArray) -> FloatArray:
-    """The corrected error (48,) by ``gain`` (48, 6), after a second Gauss-Newton step from the same prior.
+    """The corrected error (54,) by ``gain`` (54, 6), after a second Gauss-Newton step from the same prior.
 
     After seconds without poses the position may be off by metres. Rotation times position, the second order of the
     first step, is then larger than what the pose claims. (B. Bell, F. Cathey, "The iterated Kalman filter update as a
     Gauss-Newton method", IEEE TAC 1993.)
     """
     prior, error = innovation.prior.state, gain @ innovation.value
-    left = pose_error(prior.moved(error[CORE]), innovation.pose.T_map_body) - prior.systematic
-    return np.asarray(gain @ (left + error[POSE]))
+    T_map_markers = moved_map(error[MARKERS]) @ prior.T_map_markers
+    left = _unexplained(replace(prior.moved(error[CORE]), T_map_markers=T_map_markers), innovation.pose)
+    return np.asarray(gain @ (left + error[POSE] + innovation.H[:, MARKERS] @ error[MARKERS]))

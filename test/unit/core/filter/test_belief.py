@@ -9,6 +9,7 @@ from support.flights import config
 
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseUpdate, REFUSALS_OF_DOUBT
 from thermal_fiducial.core.filter.state import POSITION
+from thermal_fiducial.core.geometry.reprojection import lever_arm
 from thermal_fiducial.core.measurements import Condition
 
 CONFIG = config(initial_poses=3, reset_after=0.5, reinitialise_after=5.0, lost_position_std=1.0)
@@ -58,7 +59,9 @@ def test_doubt_begins_with_refusals_in_a_row():
 def test_the_error_of_the_map_counts_in_the_position_but_not_relative_to_the_map():
     begun = hypothesis(0.3)
     noise = begun.estimate.pose_noise
-    of_map = np.diag([0.16, 0.0, 0.0, 9.0, 9.0, 9.0])
+    # A motion of the map that turns it about the robot.
+    to_origin = lever_arm(-begun.estimate.state.position)
+    of_map = to_origin @ np.diag([0.16, 0.0, 0.0, 9.0, 9.0, 9.0]) @ to_origin.T
     noise = replace(noise, last=replace(noise.last, map_covariance=of_map))
     begun = begun._replace(estimate=replace(begun.estimate, pose_noise=noise))
     assert begun.estimate.std(POSITION) == pytest.approx(0.3)

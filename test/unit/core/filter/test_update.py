@@ -12,6 +12,8 @@ from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_t
 from thermal_fiducial.core.filter.state import (
     CORE,
     EXTRINSICS,
+    MARKERS,
+    moved_map,
     POSE,
     POSITION,
     ROTATION,
@@ -284,11 +286,18 @@ def test_the_map_has_the_same_error_while_its_covariance_is_the_same():
     # The robot turns, the map's error doesn't.
     again = replace(here, T_map_body=transform(turned @ so3_exp([0.0, 0.8, 0.0]), np.zeros(3)))
     # rounding
-    assert again.map_change(here) == pytest.approx(0.0, abs=1e-12)
+    assert again.map_correlation(here) == pytest.approx(1.0, abs=1e-12)
+    # Nothing is left of the former error. Bhattacharyya's coefficient of variances 1 and 1e4 in six dimensions: 8e-6
     other_markers = replace(here, map_covariance=1e4 * of_map)
-    # Nothing is left of the former error: rotation before position, in the robot frame, as isotropic as in the map.
-    assert other_markers.map_change(here) == pytest.approx(1.0, abs=1e-4)
-    np.testing.assert_allclose(other_markers.of_map, np.diag(np.repeat((1.0, 4.0), 3)), rtol=1e-9, atol=1e-9)
+    assert other_markers.map_correlation(here) == pytest.approx(0.0, abs=1e-5)
+
+
+def test_a_motion_of_the_map_moves_the_poses_of_its_markers(estimate):
+    T, step = estimate.state.T_map_body, 1e-6
+    for column, unit in enumerate(np.eye(6)):
+        moved = pose_error(estimate.state, moved_map(step * unit) @ T) / step
+        # second order of the step
+        np.testing.assert_allclose(moved, BodyPose(T, np.eye(6)).by_map[:, column], atol=1e-5)
 
 
 def test_an_error_of_the_map_that_was_larger_is_left_in_the_estimate():
@@ -352,26 +361,24 @@ def test_what_rounding_makes_of_a_large_covariance_is_no_reason_to_fail():
 
 @pytest.mark.parametrize('of_map', [0.0, 4e-4])
 def test_the_systematic_error_is_never_larger_than_a_pose_claims(estimate, still, of_map):
-    """A pose whose motion blur is not known yet claims twice as much as the next one; errors of the map add up."""
+    """A pose whose motion blur is not known yet claims twice as much as the next one; the map's error is no part."""
     now = BodyPose(estimate.state.T_map_body, 1e-4 * np.eye(6), of_map * np.eye(6))
     vague = replace(now, covariance=4.0 * now.covariance)
     covariance = 1e-12 * np.eye(SIZE)
     covariance[SYSTEMATIC, SYSTEMATIC] = vague.shape
     seen = replace(estimate, covariance=covariance, pose_noise=PoseNoise.of(vague))
     kept = innovation_of(FULL, seen, now, still).prior.covariance[SYSTEMATIC, SYSTEMATIC]
-    # The map's change since the last pose is new, and small: both are in the same view.
-    most = now.shape + now.of_map + now.map_change(vague) * now.of_map
-    assert np.linalg.eigvalsh(most - kept).min() > -1e-12
+    assert np.linalg.eigvalsh(now.shape - kept).min() > -1e-12
 
 
 def test_what_another_error_of_the_map_makes_of_a_pose_is_not_taken_for_motion(estimate, still):
-    """It goes to the systematic error of the poses, which is as uncertain as that."""
+    """It goes to the motion of the map that the markers of the poses have, which is as uncertain as that."""
     pose = estimate.state.T_map_body
     here = BodyPose(pose, 1e-6 * np.eye(6))
     other = replace(here, map_covariance=1e-2 * np.eye(6))
     seen = replace(known(estimate), pose_noise=PoseNoise.of(here))
     innovation = innovation_of(FULL, seen, other, still)
-    shown = innovation.prior.covariance[SYSTEMATIC, SYSTEMATIC].diagonal()
+    shown = innovation.prior.covariance[MARKERS, MARKERS].diagonal()
     # 1e-2 less what the covariances still have in common: Bhattacharyya's coefficient squared of 1e-6 and 1e-2
     np.testing.assert_allclose(shown, 1e-2, rtol=1e-2)
 
