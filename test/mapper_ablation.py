@@ -64,23 +64,23 @@ MECHANISMS = {
     ),
     'weights by errors': Mechanism(
         ('moved markers', 'uneven map', 'board', 'carpet'),
-        ('localization:marker_weights',),
-        {'localization:marker_weights': lambda errors, *_: np.ones(len(errors))},
+        ('joint_fit:marker_weights',),
+        {'joint_fit:marker_weights': lambda errors, *_: np.ones(len(errors))},
     ),
     'weights by the map': Mechanism(
         ('uneven map', 'chain'),
-        ('localization:_JointFit.map_weights',),
-        {'localization:_JointFit.map_weights': lambda self, *_: np.ones(len(self.sight.markers))},
+        ('joint_fit:JointFit.map_weights',),
+        {'joint_fit:JointFit.map_weights': lambda self, *_: np.ones(len(self.sight.markers))},
     ),
     'joint weights of surveyed markers': Mechanism(
         ('uneven map', 'surveyed board'),
-        ('localization:_SurveyedFit',),
+        ('joint_fit:SurveyedFit',),
         {'mapper:locate': _placed_together},
     ),
     'alternative pose': Mechanism(
         ('small markers', 'chain', 'tags test_16'),
-        ('localization:_JointFit.alternative',),
-        {'localization:_JointFit.alternative': _ignored},
+        ('joint_fit:JointFit.alternative',),
+        {'joint_fit:JointFit.alternative': _ignored},
     ),
     'poses that nearly merge': Mechanism(
         ('from the front', 'small markers'),

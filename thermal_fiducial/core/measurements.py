@@ -22,6 +22,8 @@ _F4 = '<f4'
 #: Messages older than the newest one by more than this are those of a clock that was set back, or of a bag that was
 #: restarted [ns].
 LATEST_NS = 1_000_000_000
+#: Standard deviation [rad] that a camera pose claims for turns of which it says nothing: any turn is possible.
+NOTHING_KNOWN = 3.0
 
 CORNER_FIELDS = tuple(f'{axis}{corner}' for corner in range(4) for axis in 'uv')
 CORNER_COVARIANCE_FIELDS = tuple(f'c{corner}{term}' for corner in range(4) for term in ('uu', 'uv', 'vv'))

@@ -18,6 +18,7 @@ import numpy as np
 from thermal_fiducial.core.geometry.plausibility import LEAST_INDEPENDENT
 from thermal_fiducial.core.geometry.reprojection import lever_arm
 from thermal_fiducial.core.geometry.se3 import rotation_angle
+from thermal_fiducial.core.measurements import NOTHING_KNOWN
 from thermal_fiducial.core.types import FloatArray
 
 #: Least white variance of a pose as a multiple of its own covariance. Before a recorded board 0.03 of it is white; with
@@ -31,6 +32,8 @@ LIMITS = np.array(((WHITE, 1e-8, 1e-10), (15.0, 4e-4, 1e-4)))
 _MEMORY = np.array((10.0, 300.0, 300.0))
 #: Weight of the initial values, as information about their logarithms; limit of the normalised squared innovation.
 _PRIOR, _LARGEST_SQUARE = 5.0, 9.0
+#: A pose that claims less of a turn [rad] says nothing of it: a third of what the mapper claims then.
+_UNKNOWN_TURN = NOTHING_KNOWN / 3.0
 #: Least covariance of a pose: rounding of float32 corners [rad, m].
 _ROUNDING = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
 
@@ -56,6 +59,23 @@ class BodyPose:
         turn = np.zeros((6, 6))
         turn[:3, 3:] = turn[3:, :3] = self.T_map_body[:3, :3].T
         return turn @ lever_arm(self.T_map_body[:3, 3])
+
+    def after(self, last: 'BodyPose', T_map_body: FloatArray) -> 'BodyPose':
+        """It as the ``last`` pose of the next one, seen from ``T_map_body`` of the estimate.
+
+        Of turns that it does not show, the map's error stays that of the last one; the position follows such a turn.
+        """
+        seen, turns = self.seen_from(T_map_body), self.covariance[:3, :3]
+        if turns.trace() < _UNKNOWN_TURN**2:
+            return seen
+        variances, axes = np.linalg.eigh(turns)
+        unknown = variances > _UNKNOWN_TURN**2
+        stays = np.zeros((6, 6))
+        stays[:, :3] = (self.covariance[:, :3] @ axes[:, unknown] / variances[unknown]) @ axes[:, unknown].T
+        of_last = np.linalg.solve(seen.by_map, stays @ seen.by_map)
+        of_own = np.eye(6) - of_last
+        of_map = of_own @ self.map_covariance @ of_own.T + of_last @ last.map_covariance @ of_last.T
+        return replace(seen, map_covariance=of_map)
 
     def seen_from(self, T_map_body: FloatArray) -> 'BodyPose':
         """It with ``T_map_body`` of an estimate, which shows better than a noisy pose how the view changes."""
@@ -100,6 +120,11 @@ class BodyPose:
     def _of_map(self, pose: 'BodyPose') -> FloatArray:
         """What the map's error of a ``pose`` makes of this one: covariance (6, 6)."""
         return np.asarray(self.by_map @ pose.map_covariance @ self.by_map.T)
+
+    def _in_map(self, covariance: FloatArray) -> FloatArray:
+        turn = np.zeros((6, 6))
+        turn[:3, 3:] = turn[3:, :3] = self.T_map_body[:3, :3]
+        return turn @ covariance @ turn.T
 
 
 def log_overlap(A: FloatArray, B: FloatArray) -> float:

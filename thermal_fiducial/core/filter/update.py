@@ -145,7 +145,7 @@ def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
         now = state.derivative(innovation.motion.imu)
         state = state.moved((before - now) * error[TIME_OFFSET])
         covariance = _in_clock_of_imu(config, covariance, now, innovation)
-    noise = replace(adapted_noise(innovation), last=innovation.pose.seen_from(state.T_map_body))
+    noise = replace(adapted_noise(innovation), last=innovation.pose.after(prior.pose_noise.last, state.T_map_body))
     return replace(prior, state=state, covariance=covariance, pose_noise=noise)
 
 

@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.geometry.se3 import apply, skew, so3_exp, so3_log
+from thermal_fiducial.core.geometry.se3 import (
+    apply,
+    skew,
+    so3_exp,
+    so3_left_jacobian,
+    so3_left_jacobian_inverse,
+    so3_log,
+)
 from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
 
 if TYPE_CHECKING:
@@ -40,6 +47,23 @@ def difference(T: npt.ArrayLike, T_reference: npt.ArrayLike) -> FloatArray:
     T, T_reference = np.asarray(T, dtype=np.float64), np.asarray(T_reference, dtype=np.float64)
     rotation = so3_log(T[..., :3, :3] @ T_reference[..., :3, :3].swapaxes(-1, -2))
     return np.concatenate([T[..., :3, 3] - T_reference[..., :3, 3], rotation], axis=-1)
+
+
+def screwed(T: FloatArray, d: FloatArray) -> FloatArray:
+    """Pose (4, 4) moved by ``d`` (6,) along a screw: as by :func:`retract` to first order, but about a point it orbits.
+
+    The exponential of SE(3), in these coordinates.
+    """
+    moved = T.copy()
+    moved[:3, :3] = so3_exp(d[3:]) @ T[:3, :3]
+    moved[:3, 3] += so3_left_jacobian(d[3:]) @ d[:3]
+    return moved
+
+
+def screw_difference(T: FloatArray, T_reference: FloatArray) -> FloatArray:
+    """``d`` (6,) with ``T == screwed(T_reference, d)``."""
+    rotation = so3_log(T[:3, :3] @ T_reference[:3, :3].T)
+    return np.concatenate([so3_left_jacobian_inverse(rotation) @ (T[:3, 3] - T_reference[:3, 3]), rotation])
 
 
 def lever_arm(arm: FloatArray) -> FloatArray:

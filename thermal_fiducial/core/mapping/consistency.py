@@ -16,7 +16,8 @@ from thermal_fiducial.core.error_model import covariance_of_one_error, INCONSIST
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
-from thermal_fiducial.core.mapping.localization import DECISIVE, names
+from thermal_fiducial.core.mapping.joint_fit import DECISIVE
+from thermal_fiducial.core.mapping.localization import names
 from thermal_fiducial.core.mapping.located import (
     error_std_px,
     LocatedFrame,

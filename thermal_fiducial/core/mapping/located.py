@@ -1,6 +1,6 @@
 """Records of localization: the known markers of a frame, their re-projection, and the located frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 
@@ -14,7 +14,7 @@ from thermal_fiducial.core.error_model import (
     NO_DRAWS,
 )
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, linearise
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, lever_arm, linearise, screwed
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
@@ -115,14 +115,32 @@ class Location:
     of_scales: FloatArray
     #: (4 N, 6, 2) derivative of the pose by each corner [1/px]
     corner_gains: FloatArray
-    #: standard deviation of the attitude to first order [rad], and whether no other pose is possible
-    linear_std: float
+    #: whether no other pose is possible
     settled: bool = True
 
     @property
     def rotation_std(self) -> float:
         """Standard deviation of the attitude [rad]."""
         return math.sqrt(self.pose.covariance[3:, 3:].trace())
+
+    def moved(self, step: FloatArray, unknown: FloatArray) -> 'Location':
+        """The location displaced by ``step`` (6,) along a screw, with what is ``unknown`` (6, 6) of it beside.
+
+        Errors of the corners stay what they are in the camera, those of the map what they are in the map.
+        """
+        before = self.pose.T_map_camera
+        T = screwed(before, step)
+        with_camera, with_map = np.kron(np.eye(2), T[:3, :3] @ before[:3, :3].T), lever_arm(T[:3, 3] - before[:3, 3])
+        of_map = with_map @ self.pose.map_covariance @ with_map.T
+        own = with_camera @ (self.pose.covariance - self.pose.map_covariance + unknown) @ with_camera.T
+        return replace(
+            self,
+            pose=replace(self.pose, T_map_camera=T, covariance=own + of_map, map_covariance=of_map),
+            map_gains=with_map @ self.map_gains,
+            noise=with_camera @ (self.noise + unknown) @ with_camera.T,
+            of_scales=with_camera @ self.of_scales,
+            corner_gains=with_camera @ self.corner_gains,
+        )
 
     @property
     def viewpoint(self) -> Viewpoint:
@@ -187,9 +205,8 @@ class LocatedFrame:
         """Why there is no pose to publish, in words; empty if there is one."""
         if isinstance(self.outcome, Refusal):
             return self.outcome.reason
-        # Odometry knows the attitude where a marker is seen from the front.
-        std = self.outcome.rotation_std if self.predicted is None else self.outcome.linear_std
-        if std <= VAGUE:
+        std = self.outcome.rotation_std
+        if self.predicted is not None or std <= VAGUE:
             return ''
         listed = ', '.join(str(key) for key in self.outcome.pose.marker_ids)
         return f'known to {math.degrees(std):.0f} degrees only, by marker {listed}'

@@ -125,8 +125,8 @@ class MarkerMapper:
         sight = known if known.trusted.all() else known.only(known.trusted)
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.sizes):
-            expected = predicted.pose if predicted is not None else self._last_at(stamp_ns)
-            fit = partial(locate, stamp_ns, camera=camera, prior=expected, model=self._errors)
+            odometry, last = (None, self._last_at(stamp_ns)) if predicted is None else (predicted.pose, None)
+            fit = partial(locate, stamp_ns, camera=camera, model=self._errors, odometry=odometry, last=last)
             outcome = from_consistent_markers(sight, camera, predicted, fit)
         elif len(known.sizes):
             outcome = Refusal('all known markers in view are in quarantine')

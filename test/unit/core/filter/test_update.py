@@ -32,7 +32,7 @@ from thermal_fiducial.core.filter.update import (
     pose_error,
 )
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform
-from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN
 
 FULL = config(estimate_extrinsics=True, stamp_jitter=0.0, mount_vibration=0.0)
 RATE = np.array([0.5, -1.0, 0.7])
@@ -89,6 +89,21 @@ def test_covariance_of_the_body_pose_has_the_lever_arm(estimate):
     assert np.linalg.norm(CAMERA_POSITION) > 0.1
     # 1e-5 relative: finite differences of 1e-6
     np.testing.assert_allclose(pose.covariance, J @ A @ A.T @ J.T, rtol=1e-4, atol=1e-5 * (A @ A.T).max())
+
+
+def test_of_turns_that_a_pose_does_not_show_the_error_of_the_map_stays():
+    """The last pose was off by a turn of the map about z, the next one says nothing of turns about z."""
+    turn, rest = np.array([0.0, 0.0, 1.0, 0.0, 8.0, 0.0]), np.diag(np.repeat((1e-3, 1e-3), 3) ** 2)
+    T = transform(np.eye(3), [8.0, 0.0, 0.0])
+    about_z = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    last = BodyPose(T, rest, 0.05**2 * np.outer(about_z, about_z))
+    now = BodyPose(T, rest + NOTHING_KNOWN**2 * np.outer(turn, turn), 1e-4 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
+    kept = now.after(last, T).map_covariance
+    np.testing.assert_allclose(kept[5, 5], 0.05**2, rtol=1e-3)
+    # About the origin, which the turn leaves where it is, and of all else it is that of the pose itself.
+    np.testing.assert_allclose(kept[:3, :3], 1e-4 * np.eye(3), rtol=1e-3, atol=1e-9)
+    shown = replace(now, covariance=rest)
+    np.testing.assert_array_equal(shown.after(last, T).map_covariance, now.map_covariance)
 
 
 def test_time_offset_and_extrinsics_columns(estimate, motion):

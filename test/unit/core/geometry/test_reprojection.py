@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
+from thermal_fiducial.core.geometry.reprojection import (
+    difference,
+    lever_arm,
+    linearise,
+    retract,
+    screw_difference,
+    screwed,
+    whitening,
+)
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 
 CAMERAS = [
@@ -59,3 +67,20 @@ def test_whitening_makes_the_covariance_a_unit():
     C = A @ np.swapaxes(A, -1, -2) + 0.1 * np.eye(2)
     W = whitening(C)
     np.testing.assert_allclose(W @ C @ np.swapaxes(W, -1, -2), np.broadcast_to(np.eye(2), C.shape), atol=1e-12)
+
+
+def test_a_screw_about_a_point_leaves_it_where_it_is():
+    rng = np.random.default_rng(7)
+    T, point, turn = transform(so3_exp(rng.normal(size=3)), rng.normal(size=3)), rng.normal(size=3), rng.normal(size=3)
+    d = np.concatenate((np.cross(turn, T[:3, 3] - point), turn))
+    moved = screwed(T, d)
+    # As a point of the camera.
+    inside = T[:3, :3].T @ (point - T[:3, 3])
+    np.testing.assert_allclose(moved[:3, :3] @ inside + moved[:3, 3], point, atol=1e-12)
+    np.testing.assert_allclose(screw_difference(moved, T), d, atol=1e-12)
+    # Half of it twice is all of it, with the half seen from where the first one ends.
+    half = screwed(T, 0.5 * d)
+    np.testing.assert_allclose(screwed(half, lever_arm(half[:3, 3] - T[:3, 3]) @ (0.5 * d)), moved, atol=1e-12)
+    small = 1e-4 * d
+    # Of second order.
+    np.testing.assert_allclose(screwed(T, small), retract(T, small), atol=1e-7)
