@@ -1,5 +1,7 @@
 """The detector on rendered frames."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -109,16 +111,24 @@ def test_what_a_display_displaces_the_pattern_shows(frames, bent):
     assert nees < 2.0
 
 
-@pytest.mark.parametrize(('bent', 'allowed'), [(0.35, 0.019), (1.0, 0.021), (2.0, 0.03), (3.0, 0.055)])
+@cache
+def in_motion(seed):
+    """Four frames of one flight, in 2 px of motion blur."""
+    return list(render_frames('fast', seconds=20.0, seed=seed, start=440, stop=444))
+
+
+@pytest.mark.parametrize(('bent', 'allowed'), [(0.35, 0.023), (1.0, 0.021), (2.0, 0.027), (3.0, 0.055)])
 def test_what_a_display_does_to_motion_blur_is_undone(bent, allowed):
-    """In 2 px of it, black takes longer to give way to white than white to black, or the other way round."""
-    frames = list(render_frames('fast', seconds=20.0, seed=5, start=440, stop=444))
-    rows = last_rows(frames, lambda counts: displayed(counts, bent), 'fast')
-    error = corners_px(rows) - np.stack([frames[-1].corners_px[marker_id] for marker_id in rows['id'].tolist()])
-    shape = error - error.mean(axis=1, keepdims=True)
-    # 0.018, 0.019, 0.024 and 0.048 px when this was written; with lag tails in the patterns 0.020, 0.024, 0.039 and
-    # 0.065.
-    assert np.sqrt(np.mean(shape**2)) < allowed
+    """Black takes longer to give way to white than white to black, or the other way round."""
+    shapes = []
+    for seed in (5, 31, 2):
+        frames = in_motion(seed)
+        rows = last_rows(frames, lambda counts: displayed(counts, bent), 'fast')
+        error = corners_px(rows) - np.stack([frames[-1].corners_px[marker_id] for marker_id in rows['id'].tolist()])
+        shapes.append(error - error.mean(axis=1, keepdims=True))
+    # 0.0213, 0.0200, 0.0247 and 0.0499 px when this was written; 0.0212, 0.0206, 0.0256 and 0.0518 where the contrast
+    # is linear but for a bowl. The six markers of a single frame have up to a third more, or less.
+    assert np.sqrt(np.mean(np.concatenate(shapes) ** 2)) < allowed
 
 
 def test_raw_counts_are_claimed_better_than_a_display(frames):

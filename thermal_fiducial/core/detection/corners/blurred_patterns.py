@@ -11,7 +11,8 @@ it.
 All that is linear is part of the model. The warm surface and the sheet before it each have a temperature that is linear
 across the marker, so level and contrast are. The surface may be warmest in its middle, and may end one cell outside the
 marker; and smoke in front makes the level a little quadratic. The gray levels of a display are a polynomial of fourth
-order of the blurred counts.
+order of the blurred counts, and there the contrast is one of third order of the place: smoke lets through a share of
+the warmth that may change by several times within a marker.
 """
 
 from functools import cache
@@ -32,15 +33,15 @@ _SURFACE_ENDS = 1.0
 #: contrast.
 CORNERS, BLUR, LINEAR = slice(0, 8), 8, slice(9, None)
 #: Places among the linear terms of those whose amounts are known to be small: three curvatures of the level, the bowl
-#: of the warm surface, and in pictures for a display what bends its gray scale; the values of the first four at the
-#: corners.
+#: of the warm surface, and in pictures for a display six more curves of the contrast and what bends the gray scale.
 SMALL = slice(7, None)
-SMALL_AT_CORNERS = np.array([0.25, 0.25, 0.25, 0.5])
+#: Largest values in a marker of the three curvatures and the seven curves.
+LARGEST_OF_LEVEL, LARGEST_OF_CURVES = np.full(3, 0.25), np.array([0.5, 0.25, 0.25, 0.125, 0.125, 0.125, 0.125])
 #: Amounts of what bends the gray scale of a display. After a plateau equalisation markers of 27 px in motion are 0.046,
 #: 0.032, 0.027 and 0.027 px off with one to four, those of 40 px 0.17, 0.10, 0.076 and 0.073 px.
 BENDS = 3
-# Places among the linear terms of the gradients of the contrast, of the bowl, and of what bends the gray scale.
-_GRADIENTS, _BOWL, _BENT = slice(1, 3), 10, slice(11, 11 + BENDS)
+# Places among the linear terms of the gradients of the contrast, of its curves, and of what bends the gray scale.
+_GRADIENTS, _BOWL, _CURVES, _BENT = slice(1, 3), slice(10, 11), slice(10, 17), slice(17, 17 + BENDS)
 # Cumulative standard normal distribution, by a table.
 _FARTHEST = 6.0
 _Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
@@ -75,9 +76,12 @@ class PatternGrid(NamedTuple):
     between_nodes: Float32Array
     #: (P, 3 or 6) orthonormal backgrounds
     background: Float32Array
-    #: (2, P) places from the middle, in sides, and their squared distances (P,) from there
+    #: (2, P) places from the middle, in sides
     middle: Float32Array
-    bowl: Float32Array
+    #: (7, P) functions of these: squared distances from the middle, further quadratic and all cubic ones; and their
+    #: slopes (2, 7, P)
+    curves: Float32Array
+    curve_slopes: Float32Array
     #: (6, P) functions of these places up to quadratic ones
     levels: Float32Array
     #: distance of the samples [cells]
@@ -128,10 +132,16 @@ def pattern_grid(cells: int, density: int, nearer: int = 0, *, bent: bool = Fals
     background = np.linalg.qr(np.stack([*linear, a * a, a * b, b * b] if bent else linear, axis=1))[0]
     weights, middle = bilinear(a, b).astype(np.float32), np.stack([a, b]).astype(np.float32) - np.float32(0.5)
     u, v = middle
-    levels, bowl = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v]), u * u + v * v
+    no, uu, uv, vv = np.zeros_like(u), u * u, u * v, v * v
+    levels = np.stack([no + 1.0, u, v, uu, uv, vv])
+    curves = np.stack([uu + vv, uu - vv, uv, u * uu, v * uu, u * vv, v * vv])
+    by_u, by_v = [2.0 * u, 2.0 * u, v, 3.0 * uu, 2.0 * uv, vv, no], [2.0 * v, -2.0 * v, u, no, uu, 2.0 * uv, 3.0 * vv]
+    slopes = np.stack([by_u, by_v])
     nodes = (_of_nodes(b)[:, None] * _of_nodes(a)).reshape(-1, a.size).astype(np.float32)
     background = background.astype(np.float32)
-    return PatternGrid(along, weights, nodes, background, middle, bowl, levels, apart, lines, density, graded=not bent)
+    return PatternGrid(
+        along, weights, nodes, background, middle, curves, slopes, levels, apart, lines, density, graded=not bent
+    )
 
 
 def _of_nodes(share: FloatArray) -> FloatArray:
@@ -282,20 +292,23 @@ def _gaussian(
 def linear_terms(
     model: PatternModel, spread: FloatArray, grid: PatternGrid, cells: int, *, displayed: bool
 ) -> list[Float32Array]:
-    """Linear terms, (Q, ., P) each: the pattern; where it is graded its gradients, surface's end, levels, and bowl.
+    """Linear terms, (Q, ., P) each: the pattern; where it is graded its gradients, surface's end, levels, and curves.
 
-    The bowl shows through the white cells alone, what curves the level is before all cells. In a picture for a display
-    also what a polynomial of the counts adds between black and white.
+    The bowl of the surface shows through the white cells alone, what curves the level is before all cells. In a picture
+    for a display the contrast has further curves, and there is what a polynomial of the counts adds between black and
+    white.
     """
     if not grid.graded:
         return [grid.without_background(model.value)[:, None]]
     # Of a blurred product with a linear function: the gradient of what is blurred moves with it.
     displaced = (spread / cells).astype(np.float32) @ model.slopes.swapaxes(0, 1)
     graded = model.value[:, None] * grid.middle + displaced
-    bowl = grid.bowl * (1.0 + model.value) + 2.0 * (grid.middle * displaced).sum(axis=1)
+    number = len(grid.curves) if displayed else 1
+    (by_u, by_v), white = grid.curve_slopes[:, :number], (1.0 + model.value)[:, None]
+    curves = grid.curves[:number] * white + (by_u * displaced[:, :1] + by_v * displaced[:, 1:])
     level = np.broadcast_to(grid.levels, (len(spread), *grid.levels.shape))
     # What lacks of the surface, not the surface: small numbers for sums in single precision.
-    terms = [model.value[:, None], graded, model.surface[:, None] - np.float32(1.0), level, bowl[:, None]]
+    terms = [model.value[:, None], graded, model.surface[:, None] - np.float32(1.0), level, curves]
     if displayed:
         across = 2.0 * model.value + 1.0
         bent = model.value * (1.0 + model.value)
@@ -307,7 +320,8 @@ def local_contrast(amounts: Float32Array, model: PatternModel, grid: PatternGrid
     """White minus black (Q, P or 1) where the samples are, by the amounts (Q, L) of the linear terms."""
     if not grid.graded:
         return amounts
-    contrast = amounts[:, :1] + amounts[:, _GRADIENTS] @ grid.middle + amounts[:, _BOWL, None] * grid.bowl
+    curves = amounts[:, _CURVES if displayed else _BOWL]
+    contrast = amounts[:, :1] + amounts[:, _GRADIENTS] @ grid.middle + curves @ grid.curves[: curves.shape[1]]
     if displayed:
         across, (first, second, third) = 2.0 * model.value + 1.0, amounts[:, _BENT].T[..., None]
         squared = across * across

@@ -38,6 +38,10 @@ SURFACE_FALLS = 0.1
 #: smoke before it. Behind smoke that hides 0.6 of the warmth and changes by a third of that within 20 px, any larger
 #: value leaves the same errors of clear markers, and faint ones pay for it without smoke.
 LEVEL_BENDS = 0.03
+#: Standard deviation of what the contrast is off a linear one at the sides of a marker in a picture for a display, as a
+#: share of it, by the shares of the warmth that smoke lets through: 0.1 to 0.4 within 20 px behind dense smoke. With
+#: 0.3 and 1 corners there are the same to 5 %.
+CONTRAST_BENDS = 0.5
 #: Standard deviation of the amounts that bend the gray scale of a picture for a display, as shares of the contrast: by
 #: a quadratic of 1, the scale begins or ends with a slope of 0.
 GRAY_BENDS = 1.0

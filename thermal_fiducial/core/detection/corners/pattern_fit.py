@@ -20,13 +20,15 @@ from thermal_fiducial.core.detection.corners.blurred_patterns import (
     BLUR,
     cell_weights,
     CORNERS,
+    LARGEST_OF_CURVES,
+    LARGEST_OF_LEVEL,
     LINEAR,
     pattern_grid,
     PatternView,
     SMALL,
-    SMALL_AT_CORNERS,
 )
 from thermal_fiducial.core.detection.corners.corner_errors import (
+    CONTRAST_BENDS,
     GRAY_BENDS,
     LEVEL_BENDS,
     OF_DISPLAYED_PATTERN_PX,
@@ -78,9 +80,11 @@ _LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.3, (0.5, 2.0)
 # Standard deviation of the blur, in blurs of the optics: the focus. That of the corners from where they are looked for
 # [cells].
 _FOCUS, _START = 0.3, 0.5
-# Standard deviations of amounts that are small, as shares of the contrast.
-_SMALL_STD = np.concatenate(
-    [np.array([LEVEL_BENDS, LEVEL_BENDS, LEVEL_BENDS, SURFACE_FALLS]) / SMALL_AT_CORNERS, np.full(BENDS, GRAY_BENDS)]
+# Standard deviations of amounts that are small, as shares of the contrast: in counts, and in pictures for a display.
+_LEVEL_STD, _BENDS_STD = LEVEL_BENDS / LARGEST_OF_LEVEL, np.full(BENDS, GRAY_BENDS)
+_SMALL_STD = (
+    np.concatenate([_LEVEL_STD, SURFACE_FALLS / LARGEST_OF_CURVES[:1]]),
+    np.concatenate([_LEVEL_STD, CONTRAST_BENDS / LARGEST_OF_CURVES, _BENDS_STD]),
 )
 # Parameters of a fit: corners, blur, contrast, warm surface, level, background. A fit to something that is not there
 # makes use of fewer, as outlines bound the corners: with 9 the evidence in textures is alike from 5 to 12 px, with 5 it
@@ -120,8 +124,8 @@ class _Prior(NamedTuple):
         precision[:, CORNERS] = 1.0 / self.corners_std[:, None] ** 2
         precision[:, BLUR] = 1.0 / (_FOCUS * self.blur_px) ** 2
         of_contrast = 1.0 / (at.contrast * at.contrast + TINY)
-        small = at.amounts[:, SMALL].shape[1]
-        precision[:, LINEAR][:, SMALL] = (1.0 / _SMALL_STD[:small]) ** 2 * of_contrast[:, None]
+        small = _SMALL_STD[at.unevenness is not None]
+        precision[:, LINEAR][:, SMALL] = (1.0 / small) ** 2 * of_contrast[:, None]
         return precision * _variance_of_samples(at, self.blur_px)[:, None]
 
 
