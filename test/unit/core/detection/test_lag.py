@@ -137,6 +137,14 @@ def test_a_wrong_lag_leaves_the_common_shift_out():
     np.testing.assert_allclose(wrong_lag(common)[0, 0], (0.014 * 3.0) ** 2 * np.eye(2), rtol=1e-6)
 
 
+def test_blur_that_a_wrong_twist_leaves_on_displays_changes_the_shape():
+    """All corners are displaced by 2 px for 1 rad/s, which is known to 0.3 rad/s."""
+    by_twist = np.tile(2.0 * np.eye(2, 6, k=3), (1, 4, 1, 1))
+    still, unsure = np.zeros((1, 4, 2)), np.diag([0.0, 0.0, 0.0, 0.3, 0.0, 0.0]) ** 2
+    claimed = of_motion_blur(by_twist, unsure, still, displayed=True)[0, 0]
+    np.testing.assert_allclose(claimed, (0.15 * 2.0 * 0.3) ** 2 * np.eye(2), rtol=1e-6)
+
+
 def test_an_unknown_motion_is_limited_by_sharp_edges_and_by_cells_that_can_be_read():
     displacement = np.tile(0.01 * 500.0 * np.eye(2, 6, k=3), (4, 4, 1, 1))
     cell = np.array([10.0, 10.0, 30.0, 10.0])

@@ -17,10 +17,16 @@ from support.small_pictures import (
 from thermal_fiducial.cli.marker_measurement import camera_and_detector, show
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.blurred_patterns import lens_bends, pattern_grid, PatternView
+from thermal_fiducial.core.detection.corners.gray_scale import UNKNOWN_SCALE
 from thermal_fiducial.core.detection.corners.pattern_fit import evidence_of, fit_patterns, nearness
 from thermal_fiducial.core.detection.corners.pattern_residuals import products_of, Unevenness
+from thermal_fiducial.core.detection.corners.refining import refine
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.detection.patterns import Decoder
+from thermal_fiducial.core.detection.prediction.frame import Frame, Places
+from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers, FoundMarkers
+from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
+from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import seen_between
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
@@ -304,6 +310,25 @@ def test_contrast_that_dense_smoke_curves_displaces_little():
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.12
     # 1.7, and 2.6.
     assert np.median(np.concatenate(squares)) < 2.2
+
+
+def test_markers_that_smoke_makes_unlike_their_patterns_show_the_motion():
+    """None is evidence of its marker by itself; all have moved by 3 px since the last frame."""
+    dictionary, config, dt = load_dictionary('DICT_4X4_50'), ArucoDetectorConfig(bolometer_lag=0.0), 1 / 30
+    counts, corners = behind_dense_smoke(0)
+    picture = np.rint(255.0 * np.clip(counts / counts.max(), 0.0, 1.0)).astype(np.uint8)
+    ids, px = np.array(sorted(corners)), np.array([corners[key] for key in sorted(corners)])
+    depth, no = np.ones((len(ids), 4)), np.zeros(len(ids), dtype=bool)
+    predicted = Twist(np.zeros(6), 0.3**2 * np.eye(6))
+    frame = Frame.of(round(dt * 1e9), picture, CAMERA, predicted, config, keep_columns=True)
+    found = FoundMarkers(ids, Places.of(ImagePoints.at(px, CAMERA), depth), np.full(len(ids), 20.0), no, no)
+    last = ExpectedMarkers(ids, ImagePoints.at(px - [3.0, 0.0], CAMERA).x, depth, np.full(len(ids), 20.0))
+    track = MotionTrack(np.eye(4), config.bolometer_lag).after(0, predicted, last)
+    decoder = Decoder(dictionary.bits, dictionary.correctable)
+    refined, _ = refine(frame, found, track, UNKNOWN_SCALE, decoder, config)
+    assert not refined.observed.evident.any()
+    moved = (refined.places.flow @ refined.twist.value)[..., 0].mean() * dt
+    np.testing.assert_allclose(moved, 3.0, atol=0.3)
 
 
 def test_smoke_within_larger_markers_of_a_display_displaces_little():

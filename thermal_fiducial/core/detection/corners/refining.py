@@ -213,8 +213,9 @@ def _at_stamp(
     if frame.twist is not None or known is None:
         sure = np.ones(len(ids), dtype=bool)
         if frame.displayed:
-            # What looks like a small marker may be another thing.
+            # What looks like a small marker may be another thing, unless it has moved as the last frame's should have.
             sure = refined.evident | ~refined.small
+            sure |= track.explains(frame.stamp_ns, frame.twist, ids, at.x, places.depth, deviation)
         twist = track.correct(frame.stamp_ns, frame.twist, ids[sure], at.x[sure], places.depth[sure], deviation[sure])
     if twist is None:
         unsure = doubted + _of_unpredicted_motion(frame, places, refined, UNKNOWN_TWIST, cells)

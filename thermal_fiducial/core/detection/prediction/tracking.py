@@ -22,7 +22,7 @@ from thermal_fiducial.core.detection.prediction.twist import (
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import twist_transfer
 from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
-from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
 
 # Longest time between frames whose motion is related [ns].
 _STALE_NS = 150_000_000
@@ -30,6 +30,8 @@ _STALE_NS = 150_000_000
 _JITTER_S = 0.001
 # Number of coordinates of the corners of a marker.
 _COORDINATES = 8
+# Standard deviations within which a marker has moved as the twist predicts.
+_SIGMAS = 3.0
 # Odometry that gives the twist of a frame: from 3 time constants of the lag before the frame to one after it, a window
 # about the velocity of one time constant before, which causes the blur. Largest number of states; time constant that is
 # assumed without lag [ns].
@@ -114,6 +116,33 @@ class MotionTrack:
         later = -0.5 * (begin + end)
         value = weighted @ velocity - share * (stretched @ velocity)
         return corrected(start, information, value, later, later + self.lag)
+
+    def explains(
+        self,
+        stamp_ns: int,
+        predicted: Twist | None,
+        ids: IntArray,
+        x: FloatArray,
+        depth: FloatArray,
+        noise: FloatArray,
+    ) -> BoolArray:
+        """Which markers (N,) were in the last frame, and have moved since as the twist allows; as in :meth:`correct`.
+
+        Their centres are within three standard deviations of where its covariance and the jitter of stamps allow.
+        """
+        explained = np.zeros(len(ids), dtype=np.bool_)
+        now, before = np.nonzero(ids[:, None] == self.markers.ids)
+        dt = self._since(stamp_ns)
+        if dt is None:
+            return explained
+        twist = predicted or UNKNOWN_TWIST
+        A = dt * interaction(0.5 * (x[now] + self.markers.x[before]), depth[now]).mean(axis=1)
+        moved = (x[now] - self.markers.x[before]).mean(axis=1)
+        off, jitter = moved - A @ twist.ago(0.5 * dt), math.sqrt(2.0) * _JITTER_S / dt * moved
+        S = A @ twist.covariance @ A.swapaxes(1, 2) + jitter[:, :, None] * jitter[:, None]
+        S += noise[now, None, None] ** 2 * np.eye(2)
+        explained[now] = (off * np.linalg.solve(S, off[..., None])[..., 0]).sum(axis=1) < _SIGMAS**2
+        return explained
 
     def all_clearer_than(self, cnr: float) -> bool:
         """Whether the last frame had markers, all with a contrast-to-noise ratio above ``cnr``."""
