@@ -23,7 +23,8 @@ T = TypeVar('T')
 FORMAT = 'thermal_fiducial/marker_map'
 VERSION = 1
 
-# Written decimals: nanometres and nanoradians, below any measurement.
+# Written decimals: nanometres and nanoradians, below any measurement; and significant digits of covariances, whose
+# rounding must leave them positive definite: markers far from the anchor share nearly all of their errors.
 _DIGITS = 9
 _NORM_TOLERANCE = 0.01
 # Tolerance of a covariance's symmetry and eigenvalues, relative to its largest element: rounding to six digits.
@@ -236,7 +237,7 @@ def _fields(entry: MarkerEntry) -> str:
     fields.append(f'position: {_list(round(float(value), _DIGITS) + 0.0 for value in entry.position)}')
     fields.append(f'orientation: {_list(round(float(value), _DIGITS) + 0.0 for value in entry.orientation)}')
     if any(entry.covariance):
-        fields.append(f'covariance: {_list(float(f"{value:.6g}") for value in entry.covariance)}')
+        fields.append(f'covariance: {_list(float(f"{value:.{_DIGITS}g}") for value in entry.covariance)}')
     if entry.observations:
         fields.append(f'reprojection_error_px: {_number(round(entry.reprojection_error_px, 6))}')
         fields += [f'{name}: {getattr(entry, name)}' for name in ('observations', 'first_seen_ns', 'last_seen_ns')]
