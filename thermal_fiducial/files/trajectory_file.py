@@ -69,17 +69,14 @@ def load_tum(path: str | Path) -> tuple[IntArray, FloatArray, FloatArray]:
 def _row(path: str | Path, number: int, line: str) -> tuple[int, list[float]]:
     words = line.replace(',', ' ').split()
     try:
-        seconds = Decimal(words[0])
-        if not abs(seconds) < _LATEST_S:
-            raise InputError(f'{path} line {number}: {words[0][:40]} is no stamp')
-        stamp = int((seconds * SECOND_NS).to_integral_value())
-        values = [float(word) for word in words[1:]]
-    except InputError:
-        raise
-    except (InvalidOperation, ValueError, OverflowError):
+        seconds, values = Decimal(words[0]), [float(word) for word in words[1:]]
+        is_stamp = abs(seconds) < _LATEST_S
+    except (IndexError, InvalidOperation, ValueError):
         raise InputError(f'{path} line {number}: not numbers') from None
+    if not is_stamp:
+        raise InputError(f'{path} line {number}: {words[0][:40]} is no stamp')
     if len(values) != 7 or not all(abs(value) < _LARGEST for value in values):
         raise InputError(f'{path} line {number}: {len(words)} values, or no real ones; a pose has 8')
     if math.hypot(*values[3:]) < 1e-6:
         raise InputError(f'{path} line {number}: a quaternion of no length')
-    return stamp, values
+    return int((seconds * SECOND_NS).to_integral_value()), values

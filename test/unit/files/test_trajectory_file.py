@@ -36,6 +36,7 @@ def test_reads_comments_commas_exponents_and_normalises(tmp_path):
         ('', 'no poses'),
         ('# only\n', 'no poses'),
         ('1 2 3\n', 'line 1: 3 values'),
+        (',\n', 'line 1: not numbers'),
         ('1 0 0 0 0 0 0 1\nx 0 0 0 0 0 0 1\n', 'line 2: not numbers'),
         ('1 0 0 nan 0 0 0 1\n', 'line 1'),
         ('inf 0 0 0 0 0 0 1\n', 'line 1'),
