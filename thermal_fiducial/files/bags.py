@@ -87,12 +87,12 @@ def resolve_topics(
     InputError
         A remap of a missing topic, or two topics for one name.
     """
-    plain = {topic.strip('/'): topic for topic in recorded}
+    names = {topic: topic.strip('/') for topic in recorded}
     renamed = {source.strip('/'): target.strip('/') for source, target in (remap or {}).items()}
     for source in renamed:
-        if source not in plain:
-            raise InputError(f'no topic {source} to remap; the bag has: {", ".join(sorted(plain)) or "none"}')
-    names = {topic: renamed.get(name, name) for name, topic in plain.items()}
+        if source not in names.values():
+            raise InputError(f'no topic {source} to remap; the bag has: {", ".join(sorted(names.values())) or "none"}')
+    names = {topic: renamed.get(name, name) for topic, name in names.items()}
     seconds = [f'{second_camera}/{topic}' for topic in _OF_CAMERA] if second_camera else []
     for wanted in (*seconds, *INTERFACE_TOPICS, *_COMMON_NAMES):
         matches = [topic for topic, name in names.items() if name.endswith('/' + wanted) and name not in seconds]

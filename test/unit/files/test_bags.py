@@ -120,6 +120,8 @@ def test_ambiguous_topics_are_refused():
         resolve_topics(['/a/imu/data', '/b/imu/data'])
     with pytest.raises(InputError, match='several topics'):
         resolve_topics(['/imu/data', '/mine'], {'/mine': 'imu/data'})
+    with pytest.raises(InputError, match='several topics'):
+        resolve_topics(['/imu/data', 'imu/data'])
     with pytest.raises(InputError, match=r'no topic nothing to remap; the bag has: imu/data'):
         resolve_topics(['/imu/data'], {'/nothing': 'imu/data'})
 
