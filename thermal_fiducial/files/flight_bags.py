@@ -58,7 +58,8 @@ def write_recording(
     parameters = {'/**': {'ros__parameters': _parameters(recording.rig)}}
     with BagWriter(out, storage) as bag:
         for stamp_ns, topic, message in heapq.merge(*parts, key=lambda event: event[0]):
-            bag.write(topic, stamp_ns, message)
+            # Stamps may begin at 0, with frames from before the IMU's; bags have no earlier times.
+            bag.write(topic, max(stamp_ns, 0), message)
             if topic in (IMAGE_TOPIC, MARKERS_TOPIC, CAMERA_POSE_TOPIC):
                 progress(1)
         text = yaml.safe_dump(parameters, sort_keys=False, default_flow_style=None, width=120)

@@ -109,6 +109,22 @@ def test_camera_poses_with_their_covariance(ours):
     np.testing.assert_array_equal(message.pose.covariance, covariance)
 
 
+def test_frames_may_come_before_the_clock_of_the_imu_begins(ours):
+    """Both clocks begin at 0, that of the camera 20 ms early."""
+    for name in ('imu.csv', 'cam1.csv'):
+        text = (ours / name).read_text()
+        (ours / name).write_text(
+            re.sub(r'^\d+', lambda stamp: str(int(stamp[0]) - small_bag.START_NS), text, flags=re.M)
+        )
+    (ours / 'reference.tum').unlink()
+    (ours / 'rig.yaml').write_text(yaml.safe_dump(rig(time_offset=-0.02)))
+    assert run(ours) == 0
+    found = contents(ours.parent / 'bag')
+    assert [(at, stamp_to_ns(message.header.stamp)) for at, message in found['markers'][:2]] == [
+        (0, 0), (30_000_000, 50_000_000),
+    ]  # fmt: skip
+
+
 def test_stamps_that_go_back_stay_in_the_bag(ours):
     lines = (ours / 'imu.csv').read_text().splitlines()
     lines[10], lines[11] = lines[11], lines[10]
