@@ -19,12 +19,13 @@ from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import map_history
 from thermal_fiducial.files.atomic import locked
 from thermal_fiducial.files.csv_rows import csv_rows
 from thermal_fiducial.files.dictionary import not_in_dictionary
-from thermal_fiducial.files.map_format import upgraded
+from thermal_fiducial.files.map_format import read_document, upgraded
 from thermal_fiducial.files.marker_map import dump_map, load_map
 from thermal_fiducial.files.packages import require_plots
 from thermal_fiducial.map_tools import map_editing
@@ -64,8 +65,13 @@ def add_arguments(parser: Parser) -> None:
     map_cloud.add_align(add_command(commands, 'align', 'align a map to a point cloud of the place'))
     for name, action in commands.choices.items():
         add_sizes(action, behind=True, without=_SIZE_WITHOUT.get(name, 'none'))
-    for place in (parser, commands.choices['undo']):
-        place.refuse(['--marker-size', '--marker-size-override'], 'with map undo', lambda args: args.do is _undo)
+    without_sizes = _history, _undo, _upgrade
+    for place in (parser, *(commands.choices[name] for name in ('history', 'undo', 'upgrade'))):
+        place.refuse(
+            ['--marker-size', '--marker-size-override'],
+            'with map history, undo and upgrade',
+            lambda args: args.do in without_sizes,
+        )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -271,8 +277,8 @@ def _history(args: argparse.Namespace) -> int:
     for entry in map_history.entries(args.map):
         what = entry.problem or f'{entry.content}, before: {entry.action}'
         print(f'{entry.number:6d}  {what}')
-    current = _load(args)
-    print(f'   now  revision {current.revision}, {current.size_in_words}')
+    current = read_document(str(args.map))
+    print(f'   now  revision {current.revision}, {number_of(len(current.markers), "marker")}')
     copy = map_history.autosaved(args.map)
     if copy is not None:
         print(f'autosaved  {copy.content}: map undo takes it up')
@@ -293,5 +299,5 @@ def _undo(args: argparse.Namespace) -> int:
 def _upgrade(args: argparse.Namespace) -> int:
     with locked(args.map):
         map_history.replace(args.map, upgraded(str(args.map)), 'upgrade')
-    print(f'{args.map}: upgraded; revision {_load(args).revision}')
+    print(f'{args.map}: upgraded; revision {read_document(str(args.map)).revision}')
     return 0

@@ -132,6 +132,18 @@ def test_a_map_of_one_marker_is_said_to_have_one(path, capsys):
     assert '1 markers' not in printed
 
 
+def test_maps_of_markers_without_sides_are_upgraded_and_have_a_history(tmp_path, capsys):
+    """Their sides are those of the nodes' parameters, which neither action needs."""
+    path = tmp_path / 'map.yaml'
+    entry = '{id: 2, fixed: true, position: [1, 2, 3], orientation: [0, 0, 0, 1]}'
+    path.write_text(f'format: thermal_fiducial/marker_map\nversion: 12\nmarkers:\n  - {entry}\n')
+    assert run('upgrade', path) == 0
+    assert run('history', path) == 0
+    printed = capsys.readouterr().out
+    assert f'{path}: upgraded; revision 12' in printed
+    assert 'now  revision 12, 1 marker' in printed
+
+
 @pytest.mark.parametrize(
     'arguments',
     [

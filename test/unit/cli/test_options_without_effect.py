@@ -46,8 +46,10 @@ PLATE = '--dictionary --size --thickness --stand-off --corner-radius --bridge-wi
         *(([*INTRINSICS, 'points.csv', '--size', '640', '512', *words.split()], words.split()[0], 'CSV') for words in (
             '--target circles', '--grid 8 6', '--spacing 50', '--every 5', '--most-views 80', '--remap a:=b'
         )),
-        (['map', '--marker-size', '0.3', 'undo', 'map.yaml'], '--marker-size', 'undo'),
-        (['map', 'undo', 'map.yaml', '--marker-size-override', '1:0.3'], '--marker-size-override', 'undo'),
+        *((['map', '--marker-size', '0.3', name, 'map.yaml'], '--marker-size', name)
+          for name in ('undo', 'history', 'upgrade')),
+        *((['map', name, 'map.yaml', '--marker-size-override', '1:0.3'], '--marker-size-override', name)
+          for name in ('undo', 'history', 'upgrade')),
     ],
 )  # fmt: skip
 def test_refused_with_both_names(words, option, other, capsys, tmp_path, monkeypatch):
