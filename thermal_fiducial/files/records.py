@@ -51,7 +51,9 @@ def camera(message: Any) -> 'Camera':
     # Imported here, as it imports OpenCV: the filter needs only IMU samples, and restarts faster without it.
     from thermal_fiducial.core.geometry.camera import Camera
 
-    if max(message.binning_x, message.binning_y) > 1 or message.roi.width or message.roi.height:
+    # Some drivers write the whole image for the region of interest, which means the same as zeros (sensor_msgs).
+    whole = (message.roi.width, message.roi.height) in ((0, 0), (message.width, message.height))
+    if max(message.binning_x, message.binning_y) > 1 or not whole:
         raise InputError('camera_info of a binned or cropped image')
     model = message.distortion_model or 'plumb_bob'
     try:

@@ -128,6 +128,13 @@ def test_cameras_come_back(model, coefficients):
     assert convert.camera(sent(convert.camera_info(camera, HEAD))).matches(camera)
 
 
+def test_a_region_of_interest_may_be_the_whole_image():
+    camera = Camera(640, 512, np.array([[440.4, 0.0, 320.5], [0.0, 441.0, 255.2], [0.0, 0.0, 1.0]]))
+    message = convert.camera_info(camera, HEAD)
+    message.roi = RegionOfInterest(width=640, height=512)
+    assert convert.camera(message).matches(camera)
+
+
 @pytest.mark.parametrize(
     ('message', 'reason'),
     [
