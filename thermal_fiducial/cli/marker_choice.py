@@ -36,12 +36,12 @@ def _id_list(text: str, count: int, dictionary: str) -> list[int]:
         start, dash, end = part.partition('-')
         try:
             first, last = int(start), int(end if dash else start)
+            if last < first:
+                raise ValueError
         except ValueError:
             raise InputError(f'--ids {text!r} is not a list like 0-7,12') from None
         if last >= count:
             # Before the list is made: it would fill the memory.
             raise InputError(f'{dictionary} has no marker {max(first, count)}: its IDs are 0 to {count - 1}')
         ids += range(first, last + 1)
-    if not ids:
-        raise InputError(f'--ids {text!r} names no marker')
     return list(dict.fromkeys(ids))

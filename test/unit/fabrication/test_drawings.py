@@ -399,6 +399,7 @@ def test_open_polyline_is_refused(tmp_path):
     [
         ['make', '--ids', '200'],
         ['make', '--ids', 'x'],
+        ['make', '--ids', '0-1,7-5'],
         ['make', '--formats', 'doc'],
         ['make', '--ids', '1', '--paper', 'B9'],
         ['make', '--size', '0'],
