@@ -12,7 +12,7 @@ from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
 from thermal_fiducial.cli.marker_sizes import add_sizes, join_sizes
 from thermal_fiducial.cli.parser import add_command, Commands, Parser
 from thermal_fiducial.cli.ranges import COORDINATE_M, MARKER_ID, QUATERNION, SIGMA_DEG, SIGMA_M
-from thermal_fiducial.cli.subcommands import file_to_write
+from thermal_fiducial.cli.subcommands import file_to_write, require_unit
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
@@ -189,8 +189,8 @@ def _fix(args: argparse.Namespace) -> int:
 
 
 def _move(args: argparse.Namespace) -> int:
-    if args.orientation and not 0.9 < float(np.linalg.norm(args.orientation)) < 1.1:
-        raise InputError('--orientation is no unit quaternion x y z w')
+    if args.orientation:
+        require_unit('--orientation', args.orientation)
     covariance = np.diag([args.sigma**2 / 3.0] * 3 + [np.deg2rad(args.sigma_deg) ** 2 / 3.0] * 3)
     return _edit(args, f'move {args.id}', lambda marker_map: _moved(args, marker_map, covariance))
 

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.ranges import COORDINATE_M, REACH_M
-from thermal_fiducial.cli.subcommands import file_to_write
+from thermal_fiducial.cli.subcommands import file_to_write, require_unit
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.se3 import apply, inverse, quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.wording import number_of
@@ -41,6 +41,7 @@ def add_align(parser: Parser) -> None:
 
 
 def _align(args: argparse.Namespace) -> int:
+    require_unit('the orientation of --initial', args.initial[3:])
     marker_map = load_map(args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
     if not marker_map.markers:
         raise InputError(f'{args.map}: the map has no marker')

@@ -1,9 +1,11 @@
 """Arguments that many commands have, and types of arguments."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import math
 from pathlib import Path
+
+from thermal_fiducial.errors import InputError
 
 
 def add_remap(parser: argparse.ArgumentParser) -> None:
@@ -50,6 +52,12 @@ def number(least: float, most: float, unit: str = '') -> Callable[[str], float]:
         return value
 
     return within
+
+
+def require_unit(option: str, quaternion: Sequence[float]) -> None:
+    """Raise InputError for an orientation x y z w that is far from a unit quaternion, as one of zeros."""
+    if not 0.9 < math.hypot(*quaternion) < 1.1:
+        raise InputError(f'{option} is no unit quaternion x y z w')
 
 
 def any_path(text: str) -> Path:

@@ -154,13 +154,16 @@ def test_maps_of_markers_without_sides_are_upgraded_and_have_a_history(tmp_path,
         ('move', 'MAP', 99, '--position', 0, 0, 0),
         ('show', 'MAP.missing'),
         ('align', 'MAP', '--cloud', 'missing.ply'),
+        ('align', 'MAP', '--cloud', 'CLOUD', '--initial', 0, 0, 0, 0, 0, 0, 0),
         ('merge', 'MAP', 'missing.yaml'),
         ('anchor', 'MAP', 'missing.csv'),
     ],
 )
 def test_impossible_edits_are_refused_in_one_line(path, capsys, arguments):
     before = path.read_bytes()
-    assert run(*(str(a).replace('MAP', str(path)) for a in arguments)) == 2
+    cloud = path.with_name('room.ply')
+    write_ply(cloud, np.random.default_rng(0).uniform(-1.0, 1.0, (1000, 3)))
+    assert run(*(str(a).replace('MAP', str(path)).replace('CLOUD', str(cloud)) for a in arguments)) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert path.read_bytes() == before
 
