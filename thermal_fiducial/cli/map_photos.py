@@ -14,7 +14,7 @@ from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
 from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
-from thermal_fiducial.files.images import read_picture
+from thermal_fiducial.files.images import read_gray
 from thermal_fiducial.files.reading import naming, require_folder
 
 _IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
@@ -46,12 +46,12 @@ def detect_in_photos(photos: list[Path], camera: Camera, args: argparse.Namespac
     with progress_bar('detecting') as progress:
         for k, photo in enumerate(photos):
             progress(k / len(photos))
-            counts = read_picture(photo, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+            counts = read_gray(photo)
             with naming(photo):
                 camera.require_size_of(counts)
             if counts.dtype == np.uint16:
                 thermal = True
-                frames.append(detector.detect(k * _APART_NS, counts.astype(np.uint16), camera))
+                frames.append(detector.detect(k * _APART_NS, counts, camera))
             else:
                 frames.append(_detect_in_photo(photo_detector, counts.astype(np.uint8), camera, detector))
     if args.plate_thickness and not thermal:

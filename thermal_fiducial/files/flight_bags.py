@@ -23,6 +23,7 @@ from thermal_fiducial.files.bags import (
     MARKERS_TOPIC,
     TRUTH_TOPIC,
 )
+from thermal_fiducial.files.images import read_gray
 from thermal_fiducial.files.recordings import Corners, Recording
 from thermal_fiducial.files.rig_files import Rig
 from thermal_fiducial.files.writing import write_text
@@ -84,7 +85,7 @@ def _frames(recording: Recording, sigma_px: float, late_ns: int) -> Iterator[_Ev
     for picture in recording.pictures:
         arrival = picture.stamp_ns + late_ns
         yield arrival, CAMERA_INFO_TOPIC, bag_messages.camera_info(picture.stamp_ns, camera)
-        yield arrival, IMAGE_TOPIC, bag_messages.image(picture.stamp_ns, picture.pixels())
+        yield arrival, IMAGE_TOPIC, bag_messages.image(picture.stamp_ns, read_gray(picture.path))
     for frame in recording.corners:
         arrival = frame.stamp_ns + late_ns
         yield arrival, CAMERA_INFO_TOPIC, bag_messages.camera_info(frame.stamp_ns, camera)

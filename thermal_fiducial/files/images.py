@@ -109,6 +109,20 @@ def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
     return pixels
 
 
+def read_gray(path: str | Path) -> Counts | Gray:
+    """Pixels (H, W) of a picture file of 8 or 16 bits; colours are converted to gray.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_picture`, or pixels of another kind, such as temperatures.
+    """
+    pixels = read_picture(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(f'{path}: not a picture of 8 or 16 bit')
+    return pixels
+
+
 @contextmanager
 def without_libraries_lines() -> Iterator[None]:
     """Suppress what libpng and other libraries print to stderr about a broken picture."""

@@ -11,11 +11,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 
 from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
@@ -23,7 +20,6 @@ from thermal_fiducial.core.measurements import CameraPose, ImuSample
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import csv_rows
-from thermal_fiducial.files.images import read_picture
 from thermal_fiducial.files.reading import require_folder
 from thermal_fiducial.files.records import is_imu_reading
 from thermal_fiducial.files.rig_files import body_sensor, densities, of_camchain, of_rig, of_sensor, Rig
@@ -57,19 +53,6 @@ class Picture:
 
     stamp_ns: int
     path: Path
-
-    def pixels(self) -> npt.NDArray[Any]:
-        """(H, W) uint8 or uint16.
-
-        Raises
-        ------
-        InputError
-            No picture.
-        """
-        pixels = read_picture(self.path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-        if pixels.dtype not in (np.uint8, np.uint16):
-            raise InputError(f'{self.path}: not a picture of 8 or 16 bit')
-        return pixels
 
 
 @dataclass(frozen=True)

@@ -93,6 +93,15 @@ def test_an_origin_that_is_in_no_photo_is_named_with_its_dictionary(photographed
     assert 'marker 49 of DICT_4X4_50, the origin, is in none of the 12 photos' in capsys.readouterr().err
 
 
+def test_photos_of_temperatures_are_refused(photographed, tmp_path, capsys):
+    """They were cut off to eight bits, and their markers said to be in no photo."""
+    temperatures = np.full((CAMERA.height, CAMERA.width), 25.5, np.float32)
+    cv2.imwrite(str(tmp_path / 'degrees.tiff'), temperatures)
+    options = '--origin', 2, '--marker-size', SIZE, '--out', tmp_path / 'a.yaml'
+    assert build((tmp_path, *photographed[1:]), *options) == 2
+    assert 'degrees.tiff: not a picture of 8 or 16 bit' in capsys.readouterr().err
+
+
 def thermal_photos(folder, poses):
     """Twelve pictures of 16 bits."""
     rng = np.random.default_rng(7)
