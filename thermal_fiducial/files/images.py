@@ -117,7 +117,9 @@ def read_gray(path: str | Path) -> Counts | Gray:
     InputError
         As :func:`read_picture`, or pixels of another kind, such as temperatures.
     """
-    pixels = read_picture(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    # The calibration is that of the sensor, however the camera was held.
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    pixels = read_picture(path, flags)
     if pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(f'{path}: not a picture of 8 or 16 bit')
     return pixels

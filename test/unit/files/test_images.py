@@ -1,3 +1,4 @@
+import struct
 import time
 from types import SimpleNamespace
 
@@ -6,7 +7,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.images import image_to_array, stamp_to_ns
+from thermal_fiducial.files.images import image_to_array, read_gray, stamp_to_ns
 
 PIXELS = np.array([[1, 2, 300], [4, 16383, 6]], np.uint16)
 
@@ -99,3 +100,14 @@ def test_a_broken_compressed_image_writes_nothing_past_the_log(capfd):
     with pytest.raises(InputError, match='cannot be decoded'):
         image_to_array(compressed(bytes(whole)))
     assert capfd.readouterr() == ('', '')
+
+
+def test_pixels_of_a_photo_stay_where_the_sensor_has_them(tmp_path):
+    """A camera that hangs upside down marks its photos so (EXIF); its calibration is that of the sensor."""
+    picture = np.random.default_rng(0).integers(0, 255, (32, 48)).astype(np.uint8)
+    data = cv2.imencode('.jpg', picture)[1].tobytes()
+    turned_by_half = struct.pack('<6s4sIHHHIII', b'Exif', b'II*\0', 8, 1, 0x0112, 3, 1, 3, 0)
+    marked = data[:2] + struct.pack('>2sH', b'\xff\xe1', 2 + len(turned_by_half)) + turned_by_half + data[2:]
+    for name, content in (('plain.jpg', data), ('marked.jpg', marked)):
+        (tmp_path / name).write_bytes(content)
+    np.testing.assert_array_equal(read_gray(tmp_path / 'marked.jpg'), read_gray(tmp_path / 'plain.jpg'))
