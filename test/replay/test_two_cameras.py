@@ -7,10 +7,14 @@ import pytest
 from support import small_bag
 import yaml
 
+import thermal_fiducial.cli.evaluate
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.cli.run_parameters import camera_of_run
 from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, so3_exp, transform
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, resolve_topics
 from thermal_fiducial.files.trajectory_file import load_tum
+from thermal_fiducial.report.frames import strip
+import thermal_fiducial.report.video
 
 pytestmark = pytest.mark.ros
 #: The second camera sits 0.15 m to the left, and looks 3 degrees up.
@@ -116,6 +120,18 @@ def test_the_run_can_be_replayed_from_its_markers(run, folder, recording, tmp_pa
 def test_a_second_camera_that_the_bag_lacks_is_refused(folder, capsys):
     assert replay(folder, folder / 'bag', 'up', '--second-camera', 'up') == 2
     assert f'no topic up/{IMAGE_TOPIC}' in capsys.readouterr().err
+
+
+def test_the_replayed_bag_of_a_robot_in_a_namespace_is_read_again(folder, recording, tmp_path, monkeypatch):
+    """For the video, pictures of the report, and the calibration of the run: the camera without a name is the first."""
+    events = [(stamp, f'one/{topic}', message) for stamp, topic, message in recording.events]
+    bag = small_bag.Recording(events).write(tmp_path / 'bag')
+    monkeypatch.setattr(thermal_fiducial.report.video, 'require_encoder', lambda: 'none')
+    written = []
+    monkeypatch.setattr(thermal_fiducial.cli.evaluate, 'make_video', written.append)
+    assert replay(folder, bag, 'inside', '--second-camera', 'down', '--video') == 0
+    assert len(strip(written[0])) > 5
+    assert camera_of_run(folder / 'inside').matches(small_bag.CAMERA)
 
 
 @pytest.mark.nightly

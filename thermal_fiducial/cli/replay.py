@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     replaces = refuse_other_folder(args.out)
     _check_packages(report=not args.no_report, video=args.video)
     if args.video:
-        _require_images(args.bag, parse_remaps(args.remap))
+        _require_images(args)
     replay = importlib.import_module('thermal_fiducial.replay.session')
     options = replay.Options(
         bag=args.bag,
@@ -121,11 +121,11 @@ def _check_packages(*, report: bool, video: bool) -> None:
         importlib.import_module('thermal_fiducial.report.video').require_encoder()
 
 
-def _require_images(bag: Path, remaps: Mapping[str, str]) -> None:
+def _require_images(args: argparse.Namespace) -> None:
     """Refuse a video of a bag without images before the replay, not after it."""
-    with BagReader(bag, remaps) as reader:
+    with BagReader(args.bag, parse_remaps(args.remap), second_camera=args.second_camera.strip('/')) as reader:
         if reader.image_topic not in reader.topics:
-            raise InputError(f'--video has no effect with {bag}, which has no images')
+            raise InputError(f'--video has no effect with {args.bag}, which has no images')
 
 
 def _report(run: Path) -> None:

@@ -10,7 +10,7 @@ from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.plain_yaml import load_plain
 from thermal_fiducial.files.reading import is_there
-from thermal_fiducial.report.run_folder import bag_of_run, read_summary
+from thermal_fiducial.report.run_folder import bag_of_run, bag_options, read_summary
 
 
 def camera_of_run(run: Path) -> Camera:
@@ -35,7 +35,7 @@ def camera_of_run(run: Path) -> Camera:
     if bag_path is None:
         raise InputError(f'{run}: neither a calibration nor the replayed bag is found: give --calibration')
     try:
-        with BagReader(bag_path, summary.get('remaps', {})) as bag:
+        with BagReader(bag_path, **bag_options(summary)) as bag:
             return recorded_camera(bag)
     except InputError as error:
         raise InputError(f'{error}: give --calibration') from None

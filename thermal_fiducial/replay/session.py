@@ -275,6 +275,7 @@ def _summary(options: Options, settings: Settings, bag: BagReader, played: Topic
         'bag': options.bag.resolve().name,
         'bag_path': str(options.bag.resolve()),
         'remaps': dict(options.remaps),
+        'second_camera': options.second_camera,
         'transport': options.transport,
         'mode': settings.marker_mapper.mode,
         'start_ns': bag.start_ns,

@@ -1,7 +1,7 @@
 """Thermal frames with the detections drawn on them: a strip for the page, and all of them for a video."""
 
 import base64
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
-from thermal_fiducial.report.run_folder import bag_of_run, Detections, Run
+from thermal_fiducial.report.run_folder import bag_of_run, bag_options, Detections, Run
 
 #: Number of pictures of a strip, and their width [px].
 STRIP, STRIP_WIDTH = 12, 480
@@ -47,25 +47,21 @@ class FramePicture:
     caption: str
 
 
-def bag_of(run: Run, bag: Path | None = None) -> tuple[Path, Mapping[str, str]] | None:
-    """The bag that a run was replayed from, with its remaps; None if it is not found."""
-    remaps = run.summary.get('remaps', {})
-    remaps = remaps if isinstance(remaps, dict) else {}
-    if bag is not None:
-        return bag, remaps
-    known = bag_of_run(run.path, run.summary)
-    return None if known is None else (known, remaps)
+def bag_of(run: Run, bag: Path | None = None) -> BagReader | None:
+    """The bag that a run was replayed from, to be opened with the names of its topics; None if it is not found."""
+    path = bag or bag_of_run(run.path, run.summary)
+    return None if path is None else BagReader(path, **bag_options(run.summary))
 
 
 def strip(run: Run, bag: Path | None = None) -> list[FramePicture]:
     """Pictures at even intervals over the run; none if the bag is not found."""
-    found = bag_of(run, bag)
+    replayed = bag_of(run, bag)
     stamps = run.detections.stamps_ns
-    if found is None or not len(stamps):
+    if replayed is None or not len(stamps):
         return []
     start = int(stamps[0])
     pictures = []
-    with BagReader(*found) as reader:
+    with replayed as reader:
         for wanted in _even(np.unique(stamps)):
             view = view_at(reader, int(wanted))
             if view is not None and view.pixels is not None:

@@ -126,6 +126,11 @@ def bag_of_run(path: Path, summary: dict[str, Any]) -> Path | None:
     return next((place for place in places if is_there(place)), None)
 
 
+def bag_options(summary: dict[str, Any]) -> dict[str, Any]:
+    """Arguments with which :class:`BagReader` names the topics of a replayed bag as the replay did."""
+    return {'remap': summary.get('remaps', {}), 'second_camera': summary.get('second_camera', '')}
+
+
 def _camera_time_offset_ns(path: Path) -> int:
     """t_imu - t_camera that the filter was given."""
     if not path.exists():
@@ -182,7 +187,7 @@ def _is_table_of(is_kind: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 #: Keys of a summary that the report reads, and their validation; others are ignored.
 _SUMMARY_KINDS: dict[str, Callable[[Any], bool]] = {
-    **dict.fromkeys(('bag', 'bag_path', 'mode', 'transport'), _is_text),
+    **dict.fromkeys(('bag', 'bag_path', 'mode', 'transport', 'second_camera'), _is_text),
     'start_ns': _is_stamp,
     'duration_s': _is_duration,
     'last_ns': _is_table_of(_is_stamp),

@@ -62,16 +62,16 @@ def write_video(
         No encoder, no bag, or a file that cannot be written.
     """
     encoder = require_encoder()
-    found = bag_of(run, bag)
-    if found is None:
+    replayed = bag_of(run, bag)
+    if replayed is None:
         raise InputError(f'{run.path}: no video: the bag is not where it was (--bag names it)')
-    with BagReader(*found) as reader:
+    with replayed as reader:
         count = max(1, reader.message_count([reader.image_topic]))
         rate = _rate(reader, count)
         frames = _captioned(run, reader)
         first = next(frames, None)
         if first is None:
-            raise InputError(f'{found[0]}: no video: the bag has no usable frame')
+            raise InputError(f'{reader.path}: no video: the bag has no usable frame')
         # An incomplete video is useless, and the report may show an earlier one.
         encode = _ffmpeg if encoder == 'ffmpeg' else _pyav
         with new_file(path) as new, naming(path), encode(new, first, rate) as take:

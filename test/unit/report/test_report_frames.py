@@ -102,7 +102,7 @@ def test_the_video_shows_a_frame_before_it_is_played(flight, tmp_path):
 def test_a_missing_bag_is_reported_and_another_path_can_be_given(flight, tmp_path, capsys):
     shutil.copytree(flight / 'run', tmp_path / 'run')
     run = read_run(tmp_path / 'run')
-    assert bag_of(run)[0] == flight / 'bag'
+    assert bag_of(run).path == flight / 'bag'
     (tmp_path / 'run' / 'summary.json').write_text(json.dumps({'bag': 'nowhere', 'bag_path': '/nowhere'}))
     moved = read_run(tmp_path / 'run')
     assert (bag_of(moved), strip(moved)) == (None, [])
@@ -116,7 +116,7 @@ def test_a_bag_beside_a_moved_run_is_found(flight, tmp_path):
     shutil.copytree(flight / 'run', tmp_path / 'run')
     (tmp_path / 'run' / 'summary.json').write_text(json.dumps({'bag': 'bag', 'bag_path': '/nowhere'}))
     (tmp_path / 'bag').mkdir()
-    assert bag_of(read_run(tmp_path / 'run'))[0] == tmp_path / 'bag'
+    assert bag_of(read_run(tmp_path / 'run')).path == tmp_path / 'bag'
 
 
 def test_a_recorder_with_another_clock_shows_the_same_frames(flight, tmp_path):
