@@ -174,3 +174,12 @@ def test_the_manifest_names_each_package_that_is_imported():
     assert {'rclpy', 'numpy', 'cv2'} < foreign
     for module in foreign:
         assert {module, f'python3-{module}', KEYS.get(module)} & named, module
+
+
+@pytest.mark.parametrize('page', ['doc/install.md', '.github/workflows/test.yml'])
+def test_rosdep_is_asked_for_nothing_that_it_would_have_pip_install(page):
+    """Ubuntu 24.04 refuses that, and with it all that rosdep was to install (its issue 978)."""
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+    from_pip = {element.text for element in manifest.iter('exec_depend') if element.text.endswith('-pip')}
+    skipped = (ROOT / page).read_text().partition('--skip-keys')[2].partition('\n')[0]
+    assert from_pip == set(skipped.strip(" '").split())
