@@ -42,9 +42,8 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> Dictionary:
         Neither a known name nor a readable file, or a file that is not a dictionary.
     """
     name = str(name_or_path)
-    predefined = getattr(cv2.aruco, name, None) if name.startswith('DICT_') else None
-    if predefined is not None:
-        theirs = cv2.aruco.getPredefinedDictionary(predefined)
+    if name in _predefined():
+        theirs = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         bits = _unpacked(theirs.bytesList, theirs.markerSize)
         # OpenCV 4 has maxCorrectionBits 0 for the AprilTag families.
         return Dictionary(bits, max(theirs.maxCorrectionBits, correctable_bits(bits)))
@@ -52,11 +51,7 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> Dictionary:
     try:
         text = read_text(path)
     except InputError:
-        known = [
-            *(word for word in dir(cv2.aruco) if word.startswith('DICT_')),
-            *_packaged(),
-        ]
-        close = difflib.get_close_matches(name.upper(), known, 1)
+        close = difflib.get_close_matches(Path(name).name.upper(), [*_predefined(), *_packaged()], 1)
         hint = f'; did you mean {close[0]}?' if close else ''
         raise InputError(
             f'dictionary {name[:200]!r}: neither a dictionary of OpenCV nor a readable file{hint}'
@@ -65,6 +60,11 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> Dictionary:
         return _from_document(parse_yaml(str(path), text))
     except InputError as error:
         raise InputError(f'dictionary file {error}') from None
+
+
+def _predefined() -> list[str]:
+    """Dictionaries of OpenCV."""
+    return [word for word in dir(cv2.aruco) if word.startswith('DICT_')]
 
 
 def _packaged() -> dict[str, Path]:
@@ -109,7 +109,7 @@ def dictionary_of_map(name: str, folder: Path) -> str:
     InputError
         Neither.
     """
-    if name.startswith('DICT_') or Path(name).name in _packaged():
+    if name in _predefined() or Path(name).name in _packaged():
         return Path(name).name
     if name != Path(name).name:
         raise InputError(f'{name} is not opened, as it is neither a name nor a file beside the map')

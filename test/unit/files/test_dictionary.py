@@ -93,6 +93,12 @@ def test_a_map_of_another_dictionary_is_reported(of, read_as, words):
     assert words in reported if words else reported == ''
 
 
+def test_a_file_beside_a_map_may_be_named_as_those_of_opencv_are(tmp_path):
+    save_dictionary(tmp_path / 'DICT_OWN.yaml', 'DICT_OWN', load_dictionary('DICT_5X5_50'))
+    assert 'marker 3 looks different' in other_patterns([3], 'DICT_OWN.yaml', 'DICT_4X4_50', tmp_path)
+    assert 'did you mean DICT_4X4_50?' in other_patterns([3], 'DICT_4X4_51', 'DICT_5X5_50', tmp_path)
+
+
 def test_a_map_names_a_dictionary_or_a_file_beside_it_and_opens_no_other(tmp_path):
     (tmp_path / 'maps').mkdir()
     for folder in (tmp_path, tmp_path / 'maps'):
