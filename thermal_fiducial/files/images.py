@@ -19,6 +19,8 @@ from thermal_fiducial.files.reading import read_bytes
 ENCODINGS = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 # Largest picture file: 33 megapixels of 16 bits, uncompressed, in colour.
 _LARGEST_FILE_BYTES = 250_000_000
+#: Where the stamp of a serialised header ends [bytes].
+_STAMP_END = 12
 #: Magic bytes of lossless formats: PNG, and TIFF of either byte order.
 _LOSSLESS = (b'\x89PNG', b'II*\0', b'MM\0*')
 
@@ -144,6 +146,14 @@ def stamp_to_ns(stamp: Any) -> int:
 
 
 def header_stamp_ns(cdr: bytes) -> int:
-    """Stamp of a serialised message that begins with a header (4 bytes of encapsulation before it)."""
+    """Stamp of a serialised message that begins with a header (4 bytes of encapsulation before it).
+
+    Raises
+    ------
+    InputError
+        The message ends before.
+    """
+    if len(cdr) < _STAMP_END:
+        raise InputError(f'a message of {len(cdr)} bytes, which has no stamp')
     seconds, nanoseconds = struct.unpack_from('<iI' if cdr[1] else '>iI', cdr, 4)
     return int(seconds) * SECOND_NS + int(nanoseconds)

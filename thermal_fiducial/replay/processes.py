@@ -20,6 +20,7 @@ from thermal_fiducial.files.bags import (
     IMU_TOPIC,
 )
 from thermal_fiducial.files.images import header_stamp_ns
+from thermal_fiducial.files.reading import naming
 from thermal_fiducial.replay.children import NodeProcesses
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.job import LONGEST_GAP_NS, ReplayJob
@@ -153,7 +154,8 @@ class _Player:
             now = time.monotonic_ns()
             late_ns = max(late_ns, now - due_ns)
             if message.topic in _KINDS:
-                self._latency.sent(_KINDS[message.topic], header_stamp_ns(message.cdr), now)
+                with naming(f'{message.topic} at {message.stamp_ns}'):
+                    self._latency.sent(_KINDS[message.topic], header_stamp_ns(message.cdr), now)
             self._outputs[message.topic].send(message.cdr)
             elapsed = message.stamp_ns - bag.start_ns
             if elapsed >= next_check:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.images import image_to_array, read_gray, stamp_to_ns
+from thermal_fiducial.files.images import header_stamp_ns, image_to_array, read_gray, stamp_to_ns
 
 PIXELS = np.array([[1, 2, 300], [4, 16383, 6]], np.uint16)
 
@@ -77,6 +77,11 @@ def test_compressed_images_that_are_refused(data, words):
 
 def test_stamps_are_exact():
     assert stamp_to_ns(SimpleNamespace(sec=1_700_000_000, nanosec=123_456_789)) == 1_700_000_000_123_456_789
+    cdr = struct.pack('<BBHiI', 0, 1, 0, 1_700_000_000, 123_456_789)
+    assert header_stamp_ns(cdr) == 1_700_000_000_123_456_789
+    for short in (b'', cdr[:5], cdr[:-1]):
+        with pytest.raises(InputError, match=f'{len(short)} bytes, which has no stamp'):
+            header_stamp_ns(short)
 
 
 def test_a_compressed_image_whose_chunk_promises_gigabytes_is_refused_at_once():
