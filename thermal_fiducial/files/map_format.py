@@ -26,7 +26,6 @@ VERSION = 1
 # Written decimals: nanometres and nanoradians, below any measurement; and significant digits of covariances, whose
 # rounding must leave them positive definite: markers far from the anchor share nearly all of their errors.
 _DIGITS = 9
-_NORM_TOLERANCE = 0.01
 # Tolerance of a covariance's symmetry and eigenvalues, relative to its largest element: rounding to six digits.
 _ROUNDING = 1e-6
 _MOST = 2**63 - 1
@@ -155,7 +154,7 @@ def _entry(value: Value) -> MarkerEntry:
         size=_optional(fields, 'size', _size, None),
         fixed=_optional(fields, 'fixed', Value.flag, False),
         position=tuple(fields['position'].numbers(3, _LARGEST_M)),
-        orientation=_orientation(fields['orientation']),
+        orientation=tuple(fields['orientation'].unit_quaternion()),
         covariance=_optional(fields, 'covariance', _covariance, ()),
         reprojection_error_px=_optional(fields, 'reprojection_error_px', lambda v: v.number(0.0, _LARGEST_M), 0.0),
         observations=_optional(fields, 'observations', _count, 0),
@@ -183,14 +182,6 @@ def _size(value: Value) -> float:
     if not 0.0 < size < 100.0:
         raise value.error(f'{value.quoted()} is not a side in metres')
     return size
-
-
-def _orientation(value: Value) -> tuple[float, ...]:
-    q = value.numbers(4, 10.0)
-    norm = float(np.linalg.norm(q))
-    if abs(norm - 1.0) > _NORM_TOLERANCE:
-        raise value.error(f'no unit quaternion x y z w (norm {norm:.3g})')
-    return tuple(q)
 
 
 def _covariance(value: Value) -> tuple[float, ...]:

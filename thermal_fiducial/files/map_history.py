@@ -15,7 +15,8 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.atomic import clean_up, locked, sync_folder, write_atomically
 from thermal_fiducial.files.map_format import parse_document
 from thermal_fiducial.files.marker_map import dump_map
-from thermal_fiducial.files.reading import cannot_write, read_bytes, read_text, TEXT_LIMIT_BYTES
+from thermal_fiducial.files.reading import read_bytes, read_text, TEXT_LIMIT_BYTES
+from thermal_fiducial.files.writing import into
 
 #: Number of earlier versions kept.
 KEPT = 50
@@ -107,7 +108,7 @@ def replace(path: Path, text: str, action: str) -> None:
     InputError
         The folder can't be written to, or the present file is too large or not a regular file.
     """
-    try:
+    with into(path):
         clean_up(path)
         if path.exists():
             earlier = _whatever(path)
@@ -115,8 +116,6 @@ def replace(path: Path, text: str, action: str) -> None:
                 return
             keep(path, earlier, action)
         write_atomically(path, text)
-    except OSError as error:
-        raise cannot_write(path, 'the map', error) from None
 
 
 def _whatever(path: Path) -> str:
@@ -180,12 +179,10 @@ def undo(path: Path) -> MapVersion:
             raise InputError(f'{path}: no earlier version is kept')
         last = earlier[-1]
         text = read_text(last.path)
-        try:
+        with into(path):
             clean_up(path)
             write_atomically(path, text.partition('\n')[2] if text.startswith(_MARK) else text)
             last.path.unlink()
-        except OSError as error:
-            raise cannot_write(path, 'the map', error) from None
         return last
 
 

@@ -8,9 +8,8 @@ import numpy as np
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.atomic import write_atomically
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry, read_document
-from thermal_fiducial.files.reading import cannot_write
+from thermal_fiducial.files.writing import write_text
 
 
 def load_map(
@@ -55,11 +54,7 @@ def save_map(path: str | Path, marker_map: MarkerMap) -> None:
     InputError
         The folder doesn't exist or can't be written to, or the map has a value that the reader would refuse.
     """
-    path = Path(path)
-    try:
-        write_atomically(path, dump_map(marker_map))
-    except OSError as error:
-        raise cannot_write(path, 'the map', error) from None
+    write_text(path, dump_map(marker_map))
 
 
 def dump_map(marker_map: MarkerMap) -> str:

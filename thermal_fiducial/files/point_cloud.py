@@ -10,8 +10,8 @@ from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.atomic import write_atomically
 from thermal_fiducial.files.schema import load_yaml
+from thermal_fiducial.files.writing import write_text
 
 # Sizes in a PLY or PCD header: elements, points, width and height.
 _COUNTS = re.compile(rb'^(?:element +\S+|POINTS|WIDTH|HEIGHT) +([0-9]{1,18})[0-9]*\s*$', re.MULTILINE)
@@ -81,10 +81,7 @@ def save_alignment(path: Path, T_cloud_map: FloatArray, cloud: str, frame_id: st
         'position': [round(float(v), 9) for v in T_cloud_map[:3, 3]],
         'orientation': [round(float(v), 9) for v in quaternion_from_rotation(T_cloud_map[:3, :3])],
     }
-    try:
-        write_atomically(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
-    except OSError as error:
-        raise InputError(f'{path}: cannot write the transform: {error.strerror}') from error
+    write_text(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
 
 
 def load_alignment(path: str | Path) -> FloatArray:
@@ -100,10 +97,7 @@ def load_alignment(path: str | Path) -> FloatArray:
     if 'position' not in fields or 'orientation' not in fields:
         raise root.error('not a transform written by map align: no position and orientation')
     position = fields['position'].numbers(3, LARGEST_COORDINATE)
-    orientation = fields['orientation'].numbers(4, 2.0)
-    if not 0.99 < float(np.linalg.norm(orientation)) < 1.01:
-        raise fields['orientation'].error('no unit quaternion x y z w')
-    return transform_from_quaternion(position, orientation)
+    return transform_from_quaternion(position, fields['orientation'].unit_quaternion())
 
 
 def _check_promise(path: Path) -> None:

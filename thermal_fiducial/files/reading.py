@@ -131,11 +131,6 @@ def text_lines(path: str | Path, limit: int) -> Iterator[tuple[int, str]]:
                 raise InputError(f'{path}: more than {_BLANK_LINES} blank lines from line {last + 1} on')
 
 
-def cannot_write(path: str | Path, what: str, error: OSError) -> InputError:
-    """The error for a file that cannot be written."""
-    return InputError(f'{path}: cannot write {what}: {error.strerror or error}')
-
-
 def one_line(error: Exception, longest: int = 200) -> str:
     """The message of an error as one printable line of limited length; its type if the message is empty."""
     text = ' '.join(str(error).split()) or type(error).__name__

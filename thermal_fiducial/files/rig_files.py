@@ -59,15 +59,14 @@ def of_rig(path: Path, camera: str) -> Rig:
     root = _document(path)
     entry = _needed(_needed(root, 'cameras'), camera)
     fields, top = entry.mapping(), root.mapping()
-    lens = _lens(
-        entry, _size(_needed(entry, 'width')), _size(_needed(entry, 'height')), _needed(entry, 'K'), 'model', 'D'
-    )
+    K = _numbers(_needed(entry, 'K'), 9).reshape(3, 3)
+    lens = _lens(entry, _size(_needed(entry, 'width')), _size(_needed(entry, 'height')), K, 'model', 'D')
     if 'T_body_camera' in fields:
         T_body_camera = _rigid(fields['T_body_camera'])
     else:
-        orientation = _needed(entry, 'camera_orientation')
-        position = _numbers(_needed(entry, 'camera_position'), 3, LARGEST_COORDINATE)
-        T_body_camera = transform_from_quaternion(position, _unit(orientation))
+        orientation = _needed(entry, 'camera_orientation').unit_quaternion()
+        position = _needed(entry, 'camera_position').numbers(3, LARGEST_COORDINATE)
+        T_body_camera = transform_from_quaternion(position, orientation)
     size = top['marker_size'].number(0.0, LARGEST_MARKER_M) if 'marker_size' in top else 0.0
     dictionary = top['dictionary'].text() if 'dictionary' in top else ''
     return Rig(lens, T_body_camera, _noise(top.get('imu')), _offset(fields, 'time_offset'), size, dictionary)
@@ -163,13 +162,6 @@ def _rigid(value: Value) -> FloatArray:
     return T
 
 
-def _unit(value: Value) -> FloatArray:
-    quaternion = _numbers(value, 4, 2.0)
-    if abs(float(np.linalg.norm(quaternion)) - 1.0) > 0.01:
-        raise value.error('no unit quaternion x y z w')
-    return quaternion
-
-
 def _size(value: Value) -> int:
     return value.integer(1, _LONGEST_SIDE)
 
@@ -187,15 +179,14 @@ def _pinhole(entry: Value) -> FloatArray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def _lens(entry: Value, width: int, height: int, K: 'FloatArray | Value', model: str, coefficients: str) -> Camera:
+def _lens(entry: Value, width: int, height: int, K: FloatArray, model: str, coefficients: str) -> Camera:
     """Camera of ``entry``; ``model`` and ``coefficients`` are the names of its fields for the distortion."""
     fields = entry.mapping()
-    matrix = _numbers(K, 9).reshape(3, 3) if isinstance(K, Value) else K
     name = fields[model].text() if model in fields else 'plumb_bob'
     D = fields[coefficients].items() if coefficients in fields else []
     distortion = np.array([value.number() for value in D])
     try:
-        return require_usable(Camera(width, height, matrix, MODEL_SYNONYMS.get(name, name), distortion))
+        return require_usable(Camera(width, height, K, MODEL_SYNONYMS.get(name, name), distortion))
     except InputError as error:
         raise entry.error(str(error)) from None
 

@@ -29,6 +29,8 @@ MOST_VALUES = 150_000
 #: Longest quotation of a value in an error [characters].
 _QUOTED = 60
 
+# Of quaternions that were written with two digits.
+_NORM_TOLERANCE = 0.01
 _NUMBER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?')
 _INTEGER = re.compile(r'[-+]?\d{1,19}')
 _TRUE, _FALSE = ('true', 'yes', 'on'), ('false', 'no', 'off')
@@ -166,6 +168,20 @@ class Value:
         if not isinstance(self.content, list) or len(self.content) != length:
             raise self.error(f'not a list of {length} numbers')
         return [value.number(-limit, limit) for value in self.items()]
+
+    def unit_quaternion(self) -> list[float]:
+        """A list x y z w, whose norm is 1 but for rounding.
+
+        Raises
+        ------
+        InputError
+            It is none.
+        """
+        numbers = self.numbers(4)
+        norm = math.hypot(*numbers)
+        if abs(norm - 1.0) > _NORM_TOLERANCE:
+            raise self.error(f'no unit quaternion x y z w (norm {norm:.3g})')
+        return numbers
 
     def quoted(self) -> str:
         """The value, shortened for an error message."""
