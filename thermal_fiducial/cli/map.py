@@ -196,9 +196,7 @@ def _move(args: argparse.Namespace) -> int:
 
 
 def _moved(args: argparse.Namespace, marker_map: MarkerMap, covariance: FloatArray) -> MarkerMap:
-    if args.id not in marker_map.markers:
-        raise InputError(f'{args.map}: marker {args.id} is not in the map')
-    T = marker_map.markers[args.id].T_map_marker.copy()
+    T = map_editing.marker_of(marker_map, args.id).T_map_marker.copy()
     if args.orientation:
         T = transform_from_quaternion(args.position, args.orientation)
     T[:3, 3] = args.position
@@ -229,12 +227,11 @@ def _delete(args: argparse.Namespace) -> int:
 
 def _merge(args: argparse.Namespace) -> int:
     other = _load(args, args.other)
-    _, alignment = map_editing.merge(_load(args), other)
+    merged, alignment = map_editing.merge(_load(args), other)
     for key, residual in alignment.residuals_m.items():
         note = '  left out: it disagrees with the others' if key in alignment.outliers else ''
         print(f'marker {key}: {1e3 * residual:.1f} mm{note}')
     if args.out:
-        merged, _ = map_editing.merge(_load(args), other)
         map_history.save_with_history(args.out, merged, f'merge {args.map.name} and {args.other.name}')
         print(f'{args.out}: {merged.size_in_words}')
         return 0

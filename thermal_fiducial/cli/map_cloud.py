@@ -4,12 +4,11 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.ranges import COORDINATE_M, REACH_M
 from thermal_fiducial.cli.subcommands import file_to_write, require_unit
+from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.se3 import apply, inverse, quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.wording import number_of
@@ -64,13 +63,10 @@ def _align(args: argparse.Namespace) -> int:
 
 
 def _print_result(alignment: CloudAlignment) -> None:
-    table = Table(title='surface under each marker')
-    for name in ('ID', 'distance mm', 'angle deg', 'points'):
-        table.add_column(name, justify='right')
+    table = table_of('surface under each marker', ('ID', 'distance mm', 'angle deg', 'points'))
     for fit in sorted(alignment.fits, key=lambda fit: fit.id):
-        row = (str(fit.id), f'{1e3 * fit.distance_m:.1f}', f'{np.rad2deg(fit.angle):.2f}', str(fit.points))
-        table.add_row(*row)
-    Console().print(table)
+        table.add_row(str(fit.id), f'{1e3 * fit.distance_m:.1f}', f'{np.rad2deg(fit.angle):.2f}', str(fit.points))
+    show(table)
     distances = np.array([fit.distance_m for fit in alignment.fits])
     rms_mm = 1e3 * np.sqrt(np.mean(distances**2))
     print(f'{number_of(len(distances), "marker")}, {rms_mm:.1f} mm rms from their surfaces')

@@ -257,19 +257,17 @@ def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, cam
         raise InputError(f'{path}: no detections')
     _require_inside(path, table[:, 3:].reshape(-1, 4, 2), camera)
     table = table[np.argsort(table[:, 0], kind='stable')]
-    stamps, firsts = np.unique(table[:, 0], return_index=True)
+    _, firsts = np.unique(table[:, 0], return_index=True)
     sizes = size_overrides(tuple(args.marker_size_override))
     sizes |= {key: marker.size for key, marker in start.markers.items()}
     unknown = sorted({int(key) for key in table[:, 1]} - sizes.keys())
     if unknown and args.marker_size is None:
         raise InputError(f'{path}: markers {", ".join(map(str, unknown))} have no known side: give --marker-size')
     frames = []
-    for first, last in zip(firsts, [*firsts[1:], len(table)], strict=True):
-        rows = table[first:last]
+    for rows in np.split(table, firsts[1:]):
         ids = rows[:, 1].astype(np.int64)
         size = np.array([sizes.get(int(key), args.marker_size) for key in ids])
         frames.append(rows_from_corners(ids, rows[:, 3:].reshape(-1, 4, 2), isotropic(rows[:, 2]), size, camera))
-    assert len(frames) == len(stamps)
     return frames
 
 

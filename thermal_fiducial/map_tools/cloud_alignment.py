@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from thermal_fiducial.core.geometry.se3 import apply, skew, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker
@@ -66,15 +67,12 @@ def align_to_cloud(
     InputError
         No marker has points around it.
     ImportError
-        small_gicp or scipy is not installed.
+        small_gicp is not installed.
     """
-    from scipy.spatial import cKDTree
-
     markers = list(markers)
     tree = cKDTree(cloud)
     T = _icp(markers, cloud, T_initial, reach_m)
     planes = _planes(markers, cloud, tree, T, reach_m)
-    opened = 6
     if _step(markers, planes, T)[1]:
         # ICP drifts in unobservable directions: start from the initial transform, and move only in observable ones.
         T = T_initial
@@ -117,16 +115,16 @@ def _grid(marker: MapMarker) -> FloatArray:
 
 
 def _planes(
-    markers: list[MapMarker], cloud: FloatArray, tree: object, T: FloatArray, reach_m: float
+    markers: list[MapMarker], cloud: FloatArray, tree: cKDTree, T: FloatArray, reach_m: float
 ) -> dict[int, _Plane]:
     """Plane of the points around each marker, by total least squares on those near its surface."""
     planes = {}
     for marker in markers:
         centre = apply(T, marker.T_map_marker[None, :3, 3])[0]
-        _, nearest = tree.query(centre)  # type: ignore[attr-defined]
+        _, nearest = tree.query(centre)
         if np.linalg.norm(cloud[nearest] - centre) > reach_m:
             continue
-        around = cloud[tree.query_ball_point(cloud[nearest], marker.size)]  # type: ignore[attr-defined]
+        around = cloud[tree.query_ball_point(cloud[nearest], marker.size)]
         if len(around) < _FEWEST:
             continue
         middle = np.median(around, axis=0)

@@ -20,7 +20,7 @@ def set_fixed(marker_map: MarkerMap, ids: Iterable[int], fixed: bool) -> MarkerM
     InputError
         An ID that is not in the map.
     """
-    return _changed(marker_map, {key: replace(_get(marker_map, key), fixed=fixed) for key in ids})
+    return _changed(marker_map, {key: replace(marker_of(marker_map, key), fixed=fixed) for key in ids})
 
 
 def move(marker_map: MarkerMap, marker_id: int, T_map_marker: FloatArray, covariance: FloatArray) -> MarkerMap:
@@ -31,7 +31,7 @@ def move(marker_map: MarkerMap, marker_id: int, T_map_marker: FloatArray, covari
     InputError
         An ID that is not in the map.
     """
-    marker = _get(marker_map, marker_id)
+    marker = marker_of(marker_map, marker_id)
     moved = MapMarker(marker_id, marker.size, marker.fixed, T_map_marker, covariance)
     return _changed(marker_map, {marker_id: moved})
 
@@ -44,7 +44,7 @@ def rename(marker_map: MarkerMap, old: int, new: int) -> MarkerMap:
     InputError
         There is no marker ``old``, or already a marker ``new``.
     """
-    marker = _get(marker_map, old)
+    marker = marker_of(marker_map, old)
     if new in marker_map.markers:
         raise InputError(f'marker {new} is in the map already')
     renamed = _changed(marker_map, {new: replace(marker, id=new)})
@@ -62,7 +62,7 @@ def delete(marker_map: MarkerMap, ids: Iterable[int]) -> MarkerMap:
     """
     smaller = _changed(marker_map, {})
     for key in ids:
-        _get(marker_map, key)
+        marker_of(marker_map, key)
         smaller.markers.pop(key, None)
     return smaller
 
@@ -170,7 +170,8 @@ def with_covariances(marker_map: MarkerMap, position_std: float, rotation_std: f
     return replace(marker_map, markers={**marker_map.markers, **changed})
 
 
-def _get(marker_map: MarkerMap, marker_id: int) -> MapMarker:
+def marker_of(marker_map: MarkerMap, marker_id: int) -> MapMarker:
+    """The marker of an ID. Raises InputError if it is not in the map."""
     if marker_id not in marker_map.markers:
         known = ', '.join(str(key) for key in sorted(marker_map.markers)) or 'none'
         raise InputError(f'marker {marker_id} is not in the map; the IDs of its markers: {known}')
