@@ -22,7 +22,7 @@ setup(
     name=PACKAGE,
     version=VERSION,
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={PACKAGE: ['py.typed', '**/*.xml', '**/*.yaml', '**/*.html', '**/*.css', '**/*.js', '**/*.json']},
+    package_data={PACKAGE: ['py.typed', '**/*.xml', '**/*.yaml', '**/*.html', '**/*.css', '**/*.js']},
     data_files=[
         *ON_PATH,
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
@@ -40,11 +40,10 @@ setup(
     ],
     extras_require={
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-common-interfaces==5.3.6'],
-        'cloud': ['small_gicp', 'plyfile', 'pypcd4', 'scipy', 'rich', 'matplotlib'],
+        'cloud': ['small_gicp', 'plyfile', 'pypcd4', 'rich', 'matplotlib'],
         'cameras': ['pyusb'],  # and libusb-1.0-0, for a ThermalGrabber
         'smoother': ['gtsam>=4.3'],  # the reference of the filter's benchmark; brings pytest 9
         'tools': [
-            'scipy',
             'rich',
             'matplotlib',
             'plotly>=6',
