@@ -35,7 +35,7 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument('folder', type=Path, metavar='FOLDER', help='the recording')
     parser.add_argument('--out', type=Path, required=True, metavar='BAG', help='folder to create')
-    parser.add_argument('--camera', default='cam0', help='name of the camera (default: cam0)')
+    parser.add_argument('--camera', default='cam0', help='name of the camera')
     parser.add_argument('--camchain', type=Path, metavar='YAML', help="Kalibr's camchain (default: in the folder)")
     parser.add_argument('--imu', type=Path, metavar='YAML', help="Kalibr's IMU file (default: in the folder)")
     parser.add_argument(
@@ -48,15 +48,9 @@ def add_arguments(parser: Parser) -> None:
         help=f'standard deviation of corners without one of their own [px] (default: {_SIGMA_PX:g})',
     )
     parser.add_argument(
-        '--late',
-        type=LATE_S,
-        default=0.0,
-        metavar='S',
-        help='time from the stamp of a frame until it comes [s] (default: 0)',
+        '--late', type=LATE_S, default=0.0, metavar='S', help='time from the stamp of a frame until it comes [s]'
     )
-    parser.add_argument(
-        '--storage', choices=sorted(STORAGES), default='mcap', help='storage of the bag (default: mcap)'
-    )
+    parser.add_argument('--storage', choices=sorted(STORAGES), default='mcap', help='storage of the bag')
 
 
 def run(args: argparse.Namespace) -> int:

@@ -32,7 +32,7 @@ def add_thickness(parser: Parser) -> None:
         type=PLATE_M,
         default=0.0,
         metavar='M',
-        help='thickness of the plates, if they are cut from acrylic [m] (default: 0)',
+        help='thickness of the plates, if they are cut from acrylic [m]',
     )
 
 

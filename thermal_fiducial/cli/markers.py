@@ -19,7 +19,6 @@ from thermal_fiducial.fabrication.dictionary_search import distances, negatives,
 from thermal_fiducial.fabrication.plate import marker_drawing, PlateOptions
 from thermal_fiducial.fabrication.strength import strength_of
 from thermal_fiducial.files.dictionary import PACKAGED, save_dictionary
-from thermal_fiducial.files.writing import write_text
 
 
 def add_arguments(parser: Parser) -> None:
@@ -140,11 +139,10 @@ def _dictionary(args: argparse.Namespace) -> int:
     if args.count is not None and args.count > found:
         raise InputError(f'{number_of(found, "marker")} found, not {args.count}; try more restarts')
     kept = bits[: args.count]
-    save_dictionary(args.out, args.out.stem, Dictionary(kept, (args.distance - 1) // 2))
     count = ('' if args.count is None else f' --count {args.count}') + ' --signed' * args.signed
     command = f'--bits {args.bits} --distance {args.distance} --seed {args.seed} --restarts {args.restarts}{count}'
-    text = args.out.read_text(encoding='utf-8')
-    write_text(args.out, f'# thermal-fiducial markers dictionary {args.out.name} {command}\n{text}')
+    made_by = f'thermal-fiducial markers dictionary {args.out.name} {command}'
+    save_dictionary(args.out, args.out.stem, Dictionary(kept, (args.distance - 1) // 2), made_by)
     between, own = distances(kept)
     print(f'{args.out}: {len(kept)} of {number_of(found, "marker")}, distance {between}, to own rotations {own}')
     return 0

@@ -116,8 +116,8 @@ def dictionary_of_map(name: str, folder: Path) -> str:
     return str(folder / name)
 
 
-def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: Dictionary) -> None:
-    """Write ``dictionary`` as a dictionary file. Raises InputError if the file cannot be written."""
+def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: Dictionary, comment: str = '') -> None:
+    """Write ``dictionary`` as a dictionary file below a ``comment``. Raises InputError if it cannot be written."""
     document = {
         'format': FORMAT,
         'version': 1,
@@ -126,7 +126,8 @@ def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: Diction
         'max_correction_bits': dictionary.correctable,
         'markers': [[''.join(map(str, row)) for row in bits] for bits in dictionary.bits.tolist()],
     }
-    write_text(path, yaml.safe_dump(document, sort_keys=False, width=120))
+    head = f'# {comment}\n' if comment else ''
+    write_text(path, head + yaml.safe_dump(document, sort_keys=False, width=120))
 
 
 def _from_document(document: Value) -> Dictionary:
