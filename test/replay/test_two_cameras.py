@@ -7,14 +7,12 @@ import pytest
 from support import small_bag
 import yaml
 
-import thermal_fiducial.cli.evaluate
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.cli.run_parameters import camera_of_run
 from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, so3_exp, transform
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, resolve_topics
 from thermal_fiducial.files.trajectory_file import load_tum
 from thermal_fiducial.report.frames import strip
-import thermal_fiducial.report.video
 
 pytestmark = pytest.mark.ros
 #: The second camera sits 0.15 m to the left, and looks 3 degrees up.
@@ -126,9 +124,9 @@ def test_the_replayed_bag_of_a_robot_in_a_namespace_is_read_again(folder, record
     """For the video, pictures of the report, and the calibration of the run: the camera without a name is the first."""
     events = [(stamp, f'one/{topic}', message) for stamp, topic, message in recording.events]
     bag = small_bag.Recording(events).write(tmp_path / 'bag')
-    monkeypatch.setattr(thermal_fiducial.report.video, 'require_encoder', lambda: 'none')
+    monkeypatch.setattr('thermal_fiducial.report.video.require_encoder', lambda: 'none')
     written = []
-    monkeypatch.setattr(thermal_fiducial.cli.evaluate, 'make_video', written.append)
+    monkeypatch.setattr('thermal_fiducial.cli.replay.make_video', written.append)
     assert replay(folder, bag, 'inside', '--second-camera', 'down', '--video') == 0
     assert len(strip(written[0])) > 5
     assert camera_of_run(folder / 'inside').matches(small_bag.CAMERA)

@@ -2,11 +2,11 @@
 
 import argparse
 from collections.abc import Mapping
-import importlib
 from pathlib import Path
 import sys
 import time
 
+from thermal_fiducial.cli.evaluate import make_video
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import RATE
@@ -15,6 +15,9 @@ from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.replay.earlier_runs import refuse_other_folder
+from thermal_fiducial.report.page import evaluate_run, require_packages, write_page
+from thermal_fiducial.report.run_folder import read_run
+from thermal_fiducial.report.verdict import judge
 
 
 def add_arguments(parser: Parser) -> None:
@@ -72,8 +75,9 @@ def run(args: argparse.Namespace) -> int:
     _check_packages(report=not args.no_report, video=args.video)
     if args.video:
         _require_images(args)
-    replay = importlib.import_module('thermal_fiducial.replay.session')
-    options = replay.Options(
+    from thermal_fiducial.replay.session import Options, replay
+
+    options = Options(
         bag=args.bag,
         run=args.out,
         params=args.params,
@@ -90,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         print(f'{args.out}: replacing the earlier run there')
     started = time.monotonic()
     with progress_bar(f'replay {args.bag.name}') as progress:
-        summary = replay.replay(options, progress, _warn, _say)
+        summary = replay(options, progress, _warn, _say)
     seconds = time.monotonic() - started
     out = summary['messages_out']
     print(
@@ -99,9 +103,7 @@ def run(args: argparse.Namespace) -> int:
         f'{summary["duration_s"]:.1f} s of bag in {seconds:.1f} s'
     )
     if args.video:
-        importlib.import_module('thermal_fiducial.cli.evaluate').make_video(
-            importlib.import_module('thermal_fiducial.report.run_folder').read_run(args.out)
-        )
+        make_video(read_run(args.out))
     if not args.no_report:
         _report(args.out)
     errors = _internal_errors(summary['diagnostics'])
@@ -114,11 +116,13 @@ def _check_packages(*, report: bool, video: bool) -> None:
     """Report missing packages before the replay, not after minutes of it."""
     if report:
         try:
-            importlib.import_module('thermal_fiducial.report.page').require_packages()
+            require_packages()
         except InputError as error:
             raise InputError(f'{error}, or replay with --no-report') from None
     if video:
-        importlib.import_module('thermal_fiducial.report.video').require_encoder()
+        from thermal_fiducial.report.video import require_encoder
+
+        require_encoder()
 
 
 def _require_images(args: argparse.Namespace) -> None:
@@ -130,11 +134,9 @@ def _require_images(args: argparse.Namespace) -> None:
 
 def _report(run: Path) -> None:
     """Write the report, and print where it is and its first line."""
-    page = importlib.import_module('thermal_fiducial.report.page')
-    evaluation, numbers = page.evaluate_run(run)
-    path = page.write_page(evaluation, numbers)
-    verdict = importlib.import_module('thermal_fiducial.report.verdict').judge(evaluation, numbers)
-    print(f'{path}: {verdict.headline}')
+    evaluation, numbers = evaluate_run(run)
+    path = write_page(evaluation, numbers)
+    print(f'{path}: {judge(evaluation, numbers).headline}')
 
 
 def _internal_errors(diagnostics: Mapping[str, Mapping[str, str]]) -> list[str]:
