@@ -8,7 +8,7 @@ from thermal_fiducial.cameras.source import CapturedFrame, EndOfFramesError, Fra
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 
 #: Interval of reconnection attempts; and timeout without frames after which a camera is reopened [s].
-_RETRY_S, _STALLED_S = 1.0, 3.0
+_RETRY_S, STALLED_S = 1.0, 3.0
 
 
 class Capture:
@@ -30,7 +30,7 @@ class Capture:
         on_change: Callable[[str], None],
         *,
         retry: float = _RETRY_S,
-        stalled: float = _STALLED_S,
+        stalled: float = STALLED_S,
     ) -> None:
         self._source = source
         self._on_frame = on_frame

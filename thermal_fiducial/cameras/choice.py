@@ -1,5 +1,6 @@
 """Choice of the driver by a camera's name."""
 
+from thermal_fiducial.cameras.capture import STALLED_S
 from thermal_fiducial.cameras.pictures import Pictures
 from thermal_fiducial.cameras.source import FrameSource
 from thermal_fiducial.cameras.teax import ThermalGrabber
@@ -31,6 +32,11 @@ def make_source(config: ThermalSourceConfig) -> FrameSource:
     if is_video_device(config.camera):
         return V4l2Camera(config.camera, size, config.frame_rate)
     return Pictures(config.camera, config.frame_rate or _PICTURE_RATE, repeat=config.repeat)
+
+
+def longest_silence(config: ThermalSourceConfig) -> float:
+    """Silence that counts as a loss of the camera [s]: at a slow rate that of a lost frame does not."""
+    return max(STALLED_S, 3.0 / config.frame_rate) if config.frame_rate else STALLED_S
 
 
 def unused_parameters(config: ThermalSourceConfig) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Any
 from sensor_msgs.msg import Image
 
 from thermal_fiducial.cameras.capture import Capture
-from thermal_fiducial.cameras.choice import make_source, unused_parameters
+from thermal_fiducial.cameras.choice import longest_silence, make_source, unused_parameters
 from thermal_fiducial.cameras.source import CapturedFrame
 from thermal_fiducial.config import ThermalSourceConfig
 from thermal_fiducial.ros.base import qos
@@ -28,7 +28,7 @@ class ThermalSource(StageNode[ThermalSourceConfig]):
         self._source = self.attempt(lambda: make_source(config), None)
         self._capture: Capture | None = None
         if self._source is not None:
-            self._capture = Capture(self._source, self.on_frame, self._on_change)
+            self._capture = Capture(self._source, self.on_frame, self._on_change, stalled=longest_silence(config))
 
     def on_frame(self, frame: CapturedFrame) -> None:
         """Publish a frame; called by the reader thread."""

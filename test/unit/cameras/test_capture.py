@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.cameras.capture import Capture
-from thermal_fiducial.cameras.choice import make_source
+from thermal_fiducial.cameras.choice import longest_silence, make_source
 from thermal_fiducial.cameras.source import CapturedFrame, EndOfFramesError
 from thermal_fiducial.cameras.teax import ThermalGrabber
 from thermal_fiducial.cameras.v4l2 import V4l2Camera
@@ -74,6 +74,12 @@ def test_a_camera_that_falls_silent_is_opened_anew():
     source = Script(None, [FRAME])
     _, _, states = captured(source, lambda _, states: len(states) == 2, stalled=0.05)
     assert states == ['', 'a camera: no frame for 0.05 s']
+
+
+@pytest.mark.parametrize(('rate', 'silence'), [(0.0, 3.0), (30.0, 3.0), (0.2, 15.0)])
+def test_slow_pictures_are_no_silence(rate, silence):
+    """At 0.2 Hz they began again with the first one, every four seconds."""
+    assert longest_silence(ThermalSourceConfig(camera='pictures', frame_rate=rate)) == pytest.approx(silence)
 
 
 @pytest.mark.parametrize(
