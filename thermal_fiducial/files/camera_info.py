@@ -7,6 +7,7 @@ import numpy as np
 import yaml
 
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.plausibility import require_usable
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.schema import load_yaml, Value
@@ -30,7 +31,7 @@ def load_camera(path: str | Path) -> Camera:
     except InputError as error:
         raise InputError(f'calibration {error}') from None
     try:
-        return _camera(root.mapping())
+        return require_usable(_camera(root.mapping()))
     except InputError as error:
         # Errors of a single value name its place; errors of their combination do not.
         place = '' if str(error).startswith(str(path)) else f'{path}: '
