@@ -8,7 +8,7 @@ from typing import Any
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import ImuSample
 from thermal_fiducial.core.types import Counts, Gray
-from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.files.records import camera, imu_sample, stamp_ns
 
@@ -27,8 +27,8 @@ def read_bag(path: str | Path, remap: Mapping[str, str] | None = None) -> Iterat
 
     Parameters
     ----------
-    path : rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag``, with the topics ``thermal/image_raw``,
-        ``thermal/camera_info`` and ``imu/data``; missing ones are skipped
+    path : rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag``, with the topics ``thermal/image_raw`` or
+        ``thermal/image_raw/compressed`` (PNG), ``thermal/camera_info``, ``imu/data``; missing ones are skipped
     remap : topic of the bag to one of these names
 
     Yields
@@ -45,12 +45,12 @@ def read_bag(path: str | Path, remap: Mapping[str, str] | None = None) -> Iterat
     InputError
         An unusable bag or message.
     """
-    convert: dict[str, Callable[[Any], Camera | ImuSample | ThermalFrame]] = {
-        CAMERA_INFO_TOPIC: camera,
-        IMU_TOPIC: imu_sample,
-        IMAGE_TOPIC: _frame,
-    }
     with BagReader(path, remap) as bag:
+        convert: dict[str, Callable[[Any], Camera | ImuSample | ThermalFrame]] = {
+            CAMERA_INFO_TOPIC: camera,
+            IMU_TOPIC: imu_sample,
+            bag.image_topic: _frame,
+        }
         for recorded in bag.messages(convert):
             yield convert[recorded.topic](recorded.message)
 

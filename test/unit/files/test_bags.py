@@ -5,10 +5,12 @@ import pytest
 from rosbags.rosbag1 import Writer as Rosbag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from support import small_bag
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.bags import BagReader, parse_remaps, resolve_topics
+from thermal_fiducial.files.sensor_bag import read_bag, ThermalFrame
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STRING = 'std_msgs/msg/String'
@@ -95,6 +97,15 @@ def test_reads_ros_1_bags(tmp_path):
     assert STORE.deserialize_cdr(first.cdr, IMAGE).header.frame_id == 'cam'
     assert (first.message.header.stamp.sec, first.message.data.tolist()) == (3, list(range(12)))
     assert (second.message.x, second.message.header.stamp.nanosec) == (2.5, 5)
+
+
+def test_frames_for_the_library_may_be_compressed(tmp_path):
+    recording = small_bag.recording(0.1)
+    read = []
+    for name, kind in (('raw', recording), ('png', recording.compressed())):
+        read.append([item.counts for item in read_bag(kind.write(tmp_path / name)) if isinstance(item, ThermalFrame)])
+    assert len(read[0]) > 1
+    np.testing.assert_array_equal(read[1], read[0])
 
 
 # --- topics -------------------------------------------------------------------------------------------
