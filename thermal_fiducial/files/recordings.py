@@ -138,10 +138,11 @@ def _asl_truth(reference: Path, imu: Path) -> tuple[IntArray, FloatArray]:
 
 
 def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) -> Recording:
-    chain = camchain or next(iter(sorted(folder.glob('*camchain*.yaml'))), None)
+    chains = sorted(folder.glob('*camchain*.yaml'))
+    chain = camchain or next(iter(chains), None)
     if chain is None:
         raise InputError(f'{folder}: no camchain file beside the pictures: name it with --camchain')
-    noise = imu or next((path for path in sorted(folder.glob('*imu*.yaml')) if path != chain), None)
+    noise = imu or next((path for path in sorted(folder.glob('*imu*.yaml')) if path not in [chain, *chains]), None)
     known = {} if noise is None else densities(noise)
     place = folder / camera
     pictures = [

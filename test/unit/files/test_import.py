@@ -199,6 +199,11 @@ def test_kalibr(tmp_path):
     assert found[IMAGE_TOPIC][0][0] == FRAMES[0] + 18_000_000
     assert found[CAMERA_INFO_TOPIC][0][1].distortion_model == 'equidistant'
     np.testing.assert_array_equal(image_to_array(found[IMAGE_TOPIC][0][1]), (PICTURE >> 8).astype(np.uint8))
+    # Beside a newer one from elsewhere the camchain of the folder is no file of the IMU.
+    (tmp_path / 'newer.yaml').write_text(yaml.safe_dump({'cam1': chain | {'timeshift_cam_imu': 0.001}}))
+    assert run(folder, '--camchain', tmp_path / 'newer.yaml', '--out', tmp_path / 'again') == 0
+    values = parameters(tmp_path / 'again')
+    assert (values['camera_time_offset'], values['imu']) == (0.001, NOISE)
 
 
 def corrupt(path, change):
