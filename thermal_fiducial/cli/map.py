@@ -205,7 +205,7 @@ def _moved(args: argparse.Namespace, marker_map: MarkerMap, covariance: FloatArr
 
 def _rename(args: argparse.Namespace) -> int:
     def renamed(marker_map: MarkerMap) -> MarkerMap:
-        if args.new < 0 or _is_foreign(args.new, marker_map, args.map.parent):
+        if _is_foreign(args.new, marker_map, args.map.parent):
             raise InputError(f'{args.map}: there is no marker {args.new} in {marker_map.dictionary}')
         return map_editing.rename(marker_map, args.old, args.new)
 

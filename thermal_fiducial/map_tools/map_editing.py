@@ -152,8 +152,8 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[M
     target = np.stack([surveyed[key] for key in common])
     source = np.stack([marker_map.markers[key].T_map_marker[:3, 3] for key in common])
     extents = np.linalg.svd(target - target.mean(axis=0), compute_uv=False)
-    if extents[1] < 0.02 * extents[0]:
-        raise InputError('the surveyed markers lie on a line: they leave a rotation open')
+    if extents[1] <= 0.02 * extents[0]:
+        raise InputError('the surveyed markers lie on a line, or in one place: they leave a rotation open')
     T = rigid_alignment(target, source)
     distances = np.linalg.norm(apply(T, source) - target, axis=-1)
     return transformed(marker_map, T), dict(zip(common, distances.tolist(), strict=True))

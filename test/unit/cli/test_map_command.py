@@ -200,6 +200,15 @@ def test_anchor_moves_the_map_onto_a_survey(path, poses):
     assert run('anchor', path, survey) == 2
 
 
+@pytest.mark.parametrize('survey', ['1,0,0,1\n2,1,0,1\n3,2,0,1\n', '1,0,0,1\n2,0,0,1\n3,0,0,1\n'])
+def test_a_survey_that_leaves_a_rotation_open_is_refused(path, survey, capsys):
+    (path.parent / 'survey.csv').write_text(survey)
+    before = path.read_bytes()
+    assert run('anchor', path, path.parent / 'survey.csv') == 2
+    assert 'they leave a rotation open' in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
 def test_a_survey_that_has_a_marker_twice_is_refused(path, capsys):
     survey, before = path.with_name('survey.csv'), path.read_bytes()
     survey.write_text('0,0,0,1\n3,1,0,1\n5,0,1,1\n0,0,5,1\n')
