@@ -58,10 +58,11 @@ def _doubts_of(marker: MapMarker) -> list[Doubt]:
 
 def _overlaps(markers: Sequence[MapMarker]) -> list[Doubt]:
     found = []
-    centres = np.stack([m.T_map_marker[:3, 3] for m in markers])
+    centres, sizes = np.stack([m.T_map_marker[:3, 3] for m in markers]), np.array([m.size for m in markers])
     for i, m in enumerate(markers):
         near = np.linalg.norm(centres[i + 1 :] - centres[i], axis=-1)
-        for j in np.flatnonzero(near < 0.5 * m.size).tolist():
+        # Half of the distance at which squares cover each other however they are turned.
+        for j in np.flatnonzero(near < 0.25 * (m.size + sizes[i + 1 :])).tolist():
             other = markers[i + 1 + j]
             facing = rotation_angle(m.T_map_marker[:3, :3].T @ other.T_map_marker[:3, :3])
             apart = f'{near[j]:.3f} m and {np.rad2deg(float(facing)):.0f} deg apart'

@@ -521,6 +521,15 @@ def test_refine_prints_the_doubts_and_returns_2_if_one_spoils_the_map(path, pose
     assert 'marker 41: known to 0.17 m only' in capsys.readouterr().out
 
 
+@pytest.mark.parametrize('sizes', [(0.1, 0.5), (0.5, 0.1)])
+@pytest.mark.parametrize(('apart', 'overlap'), [(0.14, True), (0.16, False)])
+def test_whether_markers_overlap_does_not_depend_on_their_ids(sizes, apart, overlap):
+    places = np.eye(4), transform(np.eye(3), [apart, 0.0, 0.0])
+    markers = {key: MapMarker(key, sizes[key], True, T) for key, T in enumerate(places)}
+    said = [doubt.text for doubt in doubts(MarkerMap(markers))]
+    assert [text[:23] for text in said] == ['markers 0 and 1 overlap'] * overlap
+
+
 def test_large_residuals_of_all_markers_name_the_calibration(poses):
     def said(errors):
         markers = {
