@@ -62,20 +62,14 @@ class MapKeeper:
             raise InputError('parameter map_file is empty: there is no map on disk')
         return self._path
 
-    def load(self) -> MarkerMap:
-        """Load the map from the file.
+    def read(self) -> MarkerMap:
+        """The map in the file, which :meth:`take` makes the one at hand.
 
         Raises
         ------
         InputError
             There is no file, or it cannot be read.
         """
-        marker_map = self.read()
-        self.take()
-        return marker_map
-
-    def read(self) -> MarkerMap:
-        """The map in the file, which :meth:`take` makes the one at hand; raises as :meth:`load`."""
         self.finish()
         digest = map_history.digest(self.path)
         marker_map = load_map(self.path, *self._sizes)

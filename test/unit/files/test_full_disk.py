@@ -227,7 +227,8 @@ def learned(folder):
     path = folder / 'hall.yaml'
     save_map(path, small_bag.map_of((0,)))
     keeper = MapKeeper(path, small_bag.SIZE, {})
-    keeper.load()
+    keeper.read()
+    keeper.take()
     keeper.unsaved = True
     return keeper, small_bag.map_of((0, 1))
 

@@ -31,7 +31,8 @@ def path(tmp_path):
 
 def keeper_of(path):
     keeper = MapKeeper(path, 0.3, {})
-    keeper.load()
+    keeper.read()
+    keeper.take()
     keeper.unsaved = True
     return keeper
 
@@ -90,7 +91,8 @@ def test_an_autosave_is_named_offered_and_taken_up(path, capsys):
 def test_a_crashed_mapper_recovers_its_map(path):
     autosaved(keeper_of(path), grown(2))
     restarted = MapKeeper(path, 0.3, {})
-    restarted.load()
+    restarted.read()
+    restarted.take()
     recovered, note = restarted.recover(AUTOSAVE_S)
     assert recovered.revision == 2
     assert 'goes on with' in note
@@ -101,9 +103,11 @@ def test_a_crashed_mapper_recovers_its_map(path):
 def test_a_map_that_a_load_has_discarded_does_not_come_back(path):
     keeper = keeper_of(path)
     autosaved(keeper, grown(2))
-    keeper.load()
+    keeper.read()
+    keeper.take()
     restarted = MapKeeper(path, 0.3, {})
-    restarted.load()
+    restarted.read()
+    restarted.take()
     assert restarted.recover(AUTOSAVE_S) == (None, '')
 
 
@@ -123,7 +127,8 @@ def test_a_flown_map_that_is_replaced_unsaved_is_kept_beside_the_file(path):
 
 def test_a_map_that_cannot_be_put_aside_stays(path, monkeypatch):
     keeper = MapKeeper(path, 0.3, {}, flown=False)
-    keeper.load()
+    keeper.read()
+    keeper.take()
     keeper.unsaved = True
     monkeypatch.setattr(map_history, 'write_atomically', lambda *_: (_ for _ in ()).throw(OSError(28, 'No space left')))
     with pytest.raises(InputError, match=r'hall\.replaced\.yaml.*No space left'):
@@ -164,7 +169,8 @@ def test_a_file_that_another_program_has_changed_is_not_overwritten(path):
     beside = keeper.save(grown(2))
     assert beside == path.with_name('hall.new.yaml')
     assert (path.read_bytes(), whole(beside)) == (edited, 2)
-    keeper.load()
+    keeper.read()
+    keeper.take()
     assert keeper.save(grown(5)) == path
 
 
