@@ -1,7 +1,7 @@
 """Pixels of ``sensor_msgs/msg/Image`` and ``CompressedImage``, from rclpy or from a bag."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 import struct
@@ -50,29 +50,23 @@ def image_to_array(message: Any) -> Counts | Gray:
             f'image {width}x{height} {message.encoding} with row step {step} needs {max(needed, 0)} bytes, '
             f'has {len(message.data)}'
         )
-    kind = 'u1' if itemsize == 1 else '>u2' if message.is_bigendian else '<u2'
+    kind = f'{">" if message.is_bigendian else "<"}u{itemsize}'
     pixels: npt.NDArray[Any] = np.ndarray((height, width), kind, message.data, strides=(step, itemsize))
-    if itemsize == 1:
-        return np.ascontiguousarray(pixels, dtype=np.uint8)
-    return np.ascontiguousarray(pixels, dtype=np.uint16)
+    return np.ascontiguousarray(pixels, f'u{itemsize}')
 
 
 def _decompressed(message: Any) -> Counts | Gray:
     data = np.frombuffer(message.data, np.uint8)
     if not data[:4].tobytes().startswith(_LOSSLESS):
         raise InputError(f'compressed image of format {message.format!r}: only PNG keeps the counts')
-    try:
-        with without_libraries_lines():
-            pixels = None if _is_cut_png(data) else cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        pixels = None
+    pixels: npt.NDArray[Any] | None = None
+    with suppress(cv2.error), without_libraries_lines():
+        pixels = None if _is_cut_png(data) else cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise InputError(f'compressed image of {data.size} bytes cannot be decoded')
     if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(f'compressed image of format {message.format!r} is not grey')
-    if pixels.dtype == np.uint8:
-        return np.asarray(pixels, dtype=np.uint8)
-    return np.asarray(pixels, dtype=np.uint16)
+    return pixels
 
 
 def _is_cut_png(data: npt.NDArray[np.uint8]) -> bool:
