@@ -38,7 +38,10 @@ RIG = (
     '    D: [0, 0, 0, 0, 0], camera_position: [0.1, 0, 0], camera_orientation: [-0.5, 0.5, -0.5, 0.5]}\n'
     'imu: {gyroscope_noise_density: 1.0e-3, accelerometer_noise_density: 1.0e-2}\nmarker_size: 0.3\n'
 )
-DICTIONARY = 'format: thermal_fiducial/dictionary\nversion: 1\nname: OURS\nmarker_bits: 4\nmarkers: [b532, 0f9a]\n'
+DICTIONARY = (
+    'format: thermal_fiducial/dictionary\nversion: 1\nname: OURS\nmarker_size: 4\nmax_correction_bits: 1\n'
+    "markers:\n  - ['0110', '1011', '0010', '1101']\n  - ['1011', '0101', '0011', '0010']\n"
+)
 PLY = 'ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nend_header\n'
 PCD = 'VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA ascii\n'
 POINTS = '0 0 1\n1 0 2\n0 1 3\n'
@@ -86,7 +89,7 @@ class Targets:
         recording.mkdir()
         (recording / 'rig.yaml').write_text(RIG)
         (recording / 'imu.csv').write_text(
-            'stamp_ns,wx,wy,wz,ax,ay,az\n' + ''.join(f'{_START + k},0,0,0,0,0,9.8\n' for k in range(5))
+            'stamp_ns,wx,wy,wz,ax,ay,az\n' + ''.join(f'{_START + 5_000_000 * k},0,0,0,0,0,9.8\n' for k in range(5))
         )
         (recording / 'detections.csv').write_text(
             'stamp_ns,id,u0,v0,u1,v1,u2,v2,u3,v3,sigma_px\n' + f'{_START},2,1,1,9,1,9,9,1,9,0.1\n' * 3
