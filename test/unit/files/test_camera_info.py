@@ -108,6 +108,9 @@ def test_comments_commas_and_empty_lists(tmp_path):
     path = tmp_path / 'bad.txt'
     path.write_text('# dead\n\n 12, 7  # near the border\n')
     assert load_bad_pixels(path).tolist() == [[12, 7]]
+    # As editors of Windows write it.
+    path.write_bytes(b'\xef\xbb\xbf12 7\r\n3 4\r\n')
+    assert load_bad_pixels(path).tolist() == [[12, 7], [3, 4]]
     path.write_text('')
     assert load_bad_pixels(path).shape == (0, 2)
 
