@@ -1,9 +1,10 @@
 """Views of a calibration board in pictures or a bag: the usable ones, and the reasons against the others."""
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+import re
 
 import numpy as np
 
@@ -16,12 +17,13 @@ from thermal_fiducial.calibration.sources import clean_frames, pictures, RawFram
 from thermal_fiducial.calibration.targets import Sighting, Target
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 
 # Least motion of the board since the last view kept of a bag, and largest motion until the next frame [px].
 _NEW_VIEW_PX, _STILL_PX = 12.0, 0.7
+# Most reasons, and most frames named of one, in the line that ends a calibration: what can be taken in at a glance.
+_MOST_REASONS, _MOST_NAMES = 5, 3
 
 
 @dataclass
@@ -67,7 +69,7 @@ class BoardViews:
         return coverage(np.concatenate([view.sighting.pixels for view in self.kept]), *self.size)
 
     def require(self, source: Path) -> None:
-        """Require enough views; the error lists the reasons against the unusable frames.
+        """Require enough views; the error lists the reasons against the unusable frames, the most frequent first.
 
         Raises
         ------
@@ -77,11 +79,17 @@ class BoardViews:
         if len(self.kept) >= LEAST_VIEWS:
             return
         total = len(self.kept) + len(self.unusable)
-        reasons = Counter(reason for _, reason in self.unusable)
-        named = [f'{name}: {reason}' for name, reason in self.unusable] if len(self.unusable) <= 20 else []
-        named = named or [f'{number_of(count, "frame")}: {reason}' for reason, count in reasons.most_common(5)]
+        named = self._reasons()
         text = f'{source}: {len(self.kept)} of {total} frames are usable views, a calibration needs {LEAST_VIEWS}'
         raise InputError('; '.join([text, *named]))
+
+    def _reasons(self) -> list[str]:
+        """The most frequent reasons with their frames; those that differ only in a figure are one, with the first's."""
+        frames: dict[str, list[tuple[str, str]]] = defaultdict(list)
+        for name, reason in self.unusable:
+            frames[re.sub(r'\d+(\.\d+)?', '', reason)].append((name, reason))
+        often = sorted(frames.values(), key=len, reverse=True)[:_MOST_REASONS]
+        return [f'{_listed([name for name, _ in alike])}: {alike[0][1]}' for alike in often]
 
     def look_again(self, camera: Camera) -> None:
         """Find the board again in all views, with the calibrated camera."""
@@ -99,6 +107,12 @@ class BoardViews:
         radius = 0.0 if self.target is None else self.target.radius
         sightings = [view.sighting for view in self.kept]
         return choose_model(sightings, *self.size, models, radius=radius, focal_px=focal_px)
+
+
+def _listed(names: Sequence[str]) -> str:
+    if len(names) <= _MOST_NAMES:
+        return ', '.join(names)
+    return f'{names[0]} and {len(names) - 1} more'
 
 
 def look_at_pictures(source: Path, views: BoardViews, focal_px: float, most: int) -> None:

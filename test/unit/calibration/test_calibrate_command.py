@@ -1,6 +1,7 @@
 """``calibrate`` on bags: reading, choosing views, refusing."""
 
 from dataclasses import replace
+from pathlib import Path
 
 from builtin_interfaces.msg import Time
 import cv2
@@ -24,6 +25,7 @@ import yaml
 
 from thermal_fiducial.calibration.targets import Chessboard
 from thermal_fiducial.cli import calibrate_intrinsics
+from thermal_fiducial.cli.board_views import BoardViews
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry import se3
@@ -212,6 +214,19 @@ def test_unreadable_pictures_and_those_of_another_size_are_named(tmp_path, capsy
     assert 'b.png: 320x200 pixels' in err
     assert 'd.png: not a readable picture' in err
     assert 'f.tif: a picture of 320x256 float64, not 8 or 16 bit grey' in err
+
+
+def test_reasons_that_differ_in_a_figure_are_one_in_the_error():
+    """Fourteen views of a board with another diameter gave a line of fourteen reasons, in all ways to round 2.02."""
+    views = BoardViews()
+    views.unusable = [(f'v{k}.png', f'the circles are {2.01 + 0.01 * (k % 3):.2f} times as wide') for k in range(14)]
+    views.unusable += [('dark.png', 'too faint'), ('broken.png', 'not a readable picture'), ('grey.png', 'too faint')]
+    with pytest.raises(InputError) as refused:
+        views.require(Path('views'))
+    assert str(refused.value) == (
+        'views: 0 of 17 frames are usable views, a calibration needs 6; v0.png and 13 more: the circles are 2.01 times '
+        'as wide; dark.png, grey.png: too faint; broken.png: not a readable picture'
+    )
 
 
 @pytest.mark.parametrize(('tilt_deg', 'warns'), [(6.0, True), (35.0, False)])
