@@ -36,20 +36,26 @@ def fits(table: Table) -> bool:
 
 
 def _set_widths(console: Console, table: Table) -> None:
-    """Give each column its longest word, and share what is left among those with longer lines.
+    """Give each column its longest word, and share what is left among those with longer lines, headers last.
 
     Rich by itself narrows the widest column first, truncates its words, and prints beyond the window.
     """
     spare = console.width - _least_width(console, table)
-    wanted = [max(len(str(text)) for text in (column.header, *column.cells)) for column in table.columns]
     widths = [column.min_width or 0 for column in table.columns]
-    while spare > 0 and widths != wanted:
-        for index, width in enumerate(widths):
-            if spare > 0 and width < wanted[index]:
-                widths[index] += 1
-                spare -= 1
+    cells = [[len(str(text)) for text in column.cells] for column in table.columns]
+    headers = [len(str(column.header)) for column in table.columns]
+    for wanted in (list(map(_longest, cells)), [max(_longest(own), h) for own, h in zip(cells, headers, strict=True)]):
+        while spare > 0 and any(width < most for width, most in zip(widths, wanted, strict=True)):
+            for index, width in enumerate(widths):
+                if spare > 0 and width < wanted[index]:
+                    widths[index] += 1
+                    spare -= 1
     for column, width in zip(table.columns, widths, strict=True):
         column.width = width
+
+
+def _longest(lengths: Sequence[int]) -> int:
+    return max(lengths, default=0)
 
 
 def _least_width(console: Console, table: Table) -> int:

@@ -154,6 +154,16 @@ def test_replay_refuses_a_folder_that_holds_other_things(tmp_path, capsys):
     assert [path.name for path in mine.iterdir()] == ['chapter.tex']
 
 
+def test_rows_stay_on_one_line_where_headers_can_be_broken(capsys, monkeypatch):
+    """Of 80 columns headers got as much as cells: each marker of ``markers check`` took two lines."""
+    monkeypatch.setenv('COLUMNS', '80')
+    headers = ('ID', 'one piece', 'islands', 'point contacts', 'narrowest web mm', 'of', 'longest arm cells')
+    table = tables.table_of('', headers, left=['of'])
+    table.add_row('0', 'yes', '0', '0', '3.0', 'hole wall', '1')
+    tables.show(table)
+    assert 'hole wall' in capsys.readouterr().out
+
+
 def test_no_number_of_a_map_is_cut_at_80_columns(tmp_path, capsys, monkeypatch):
     entry = '{id: 7, size: 0.127, fixed: true, position: [-4.1433, 0.0309, -3.6953], orientation: [0, 0, 0, 1]}'
     path = tmp_path / 'map.yaml'
