@@ -70,16 +70,15 @@ def _check(args: argparse.Namespace) -> int:
     for complaint, times in against.items():
         print(f'{times} of {number_of(len(ids), "marker")}: {complaint}')
     between, own = distances(bits[ids])
-    pairs = negatives(bits[ids], between)
-    for a, b, apart in pairs:
-        print(f'marker {ids[a]} and the negative of {ids[b]} differ in {number_of(apart, "bit")}')
+    # Nearer than markers of the dictionary are to one another: of few markers that are chosen these may be far apart.
+    pairs = negatives(bits[ids], distances(bits)[0])
+    for a, b, bits_apart in pairs:
+        print(f'marker {ids[a]} and the negative of {ids[b]} differ in {number_of(bits_apart, "bit")}')
     if pairs:
         signed = ' and '.join(sorted(path.stem for path in PACKAGED.glob('*_SIGNED.yaml')))
         print(f'only the border shows the polarity of these: set polarity, or use {signed}, which have none')
-    print(
-        f'{good} of {number_of(len(ids), "marker")} can be cut; '
-        f'distance between markers {between}, to own rotations {own}'
-    )
+    apart = f'distance between markers {between}, ' if len(ids) > 1 else 'distance '
+    print(f'{good} of {number_of(len(ids), "marker")} can be cut; {apart}to own rotations {own}')
     return 0
 
 

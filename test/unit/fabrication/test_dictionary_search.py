@@ -99,6 +99,14 @@ def test_check_names_markers_that_are_negatives_of_one_another(capsys):
     assert 'negative' not in capsys.readouterr().out
 
 
+def test_few_markers_of_a_dictionary_are_as_near_to_negatives_as_in_the_whole(capsys):
+    """Measured by the distance of those chosen, marker 0 alone was like its own negative, 8 bits away."""
+    assert main(['markers', 'check', '--mount', 'none', '--ids', '0']) == 0
+    printed = capsys.readouterr().out
+    assert 'negative' not in printed
+    assert 'between markers' not in printed
+
+
 @pytest.mark.parametrize('name', ['STENCIL_4X4_16', 'STENCIL_4X4_100'])
 def test_packaged_dictionaries_are_reproduced_by_their_commands(name, tmp_path):
     dictionary = load_dictionary(name)
