@@ -87,10 +87,13 @@ def error_charts(evaluation: Evaluation) -> list[Chart]:
     return made
 
 
-def _limit(fused: FloatArray, three_sigma: FloatArray) -> float:
-    """Limit of the axis, so that outliers from markers do not hide the fused errors and their band."""
-    typical = float(np.percentile(three_sigma, 95)) if len(three_sigma) else 0.0
-    return 1.25 * max(float(np.percentile(np.abs(fused), 99.5)), typical, 1e-3)
+def _limit(values: FloatArray, three_sigma: FloatArray) -> float:
+    """Limit of the axis, so that neither outliers from markers nor the widest part of the band hide the values.
+
+    The band reaches its usual width alone: until clock offset and map are known it is ten times as wide.
+    """
+    usual = float(np.median(three_sigma)) if len(three_sigma) else 0.0
+    return 1.25 * max(float(np.percentile(np.abs(values), 99.5)), usual, 1e-3)
 
 
 def available_chart(evaluation: Evaluation) -> list[Chart]:
@@ -150,6 +153,9 @@ def clock_chart(evaluation: Evaluation) -> list[Chart]:
     if len(sigma_times) == len(times):
         for sign in (-3.0, 3.0):
             plots.line(1, t, 1e3 * (offset + sign * sigma), 'its 3 sigma', TRUTH, 1.0)
+        centre = float(np.median(offset))
+        limit = _limit(1e3 * (offset - centre), 3e3 * sigma)
+        plots.figure.update_yaxes(range=[1e3 * centre - limit, 1e3 * centre + limit], row=1, col=1)
     times, position = figures['position std']
     plots.line(2, evaluation.seconds(times), 1e3 * position, 'position, claimed', GOOD)
     plots.figure.update_yaxes(rangemode='tozero', row=2, col=1)

@@ -175,7 +175,7 @@ def test_without_truth_there_are_no_errors_rather_than_false_ones(tmp_path):
     assert 'osition error' not in without_library(page)
 
 
-PHONE = """<iframe id="phone" width="390" height="844" src="report.html"></iframe>
+PHONE = r"""<iframe id="phone" width="390" height="844" src="report.html"></iframe>
 <script>
 const frame = document.getElementById('phone');
 frame.onload = () => {
@@ -188,7 +188,7 @@ frame.onload = () => {
     range.selectNodeContents(cell);
     return range.getClientRects().length;
   };
-  const words = [...page.querySelectorAll('td')].filter((cell) => /^[a-z]{1,9}$/.test(cell.textContent));
+  const words = [...page.querySelectorAll('td')].filter((cell) => /^[a-z]{1,9}$|Hz\)$/.test(cell.textContent));
   const broken = words.filter((cell) => lines(cell) > 1);
   document.body.dataset.broken = broken.map((cell) => cell.textContent).join('|');
 };
@@ -200,12 +200,13 @@ frame.onload = () => {
 def test_nothing_is_wider_than_a_phone(run_folder, tmp_path):
     """The page with its paths, and all tables but those of many columns, which can be moved under the first one."""
     run = shutil.copytree(run_folder, tmp_path / ('a_run_folder_with_a_long_name' * 2))
-    said = {'pose_ekf': {'vibration rad/s/sqrt(Hz)': '0.000153832', 'seconds since accepted pose': '2.4728e-05'}}
+    said = {'vibration rad/s/sqrt(Hz)': '0.000153832', 'vibration m/s^2/sqrt(Hz)': '0.001813'}
+    said = {'pose_ekf': said | {'seconds since accepted pose': '2.4728e-05', 'expected rate [Hz]': '200 (160 to 240)'}}
     (run / 'summary.json').write_text(
         json.dumps(json.loads((run / 'summary.json').read_text()) | {'diagnostics': said})
     )
     page = without_library(write_page(*evaluate_run(run)).read_text())
-    assert 'rad/s/sqrt(Hz)' in page
+    assert '>m/s^2/sqrt(Hz)<' in page
     assert run.name in page
     (tmp_path / 'report.html').write_text(re.sub(r'<script>.*?</script>', '', page, flags=re.DOTALL))
     (tmp_path / 'phone.html').write_text(PHONE)

@@ -23,6 +23,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.report.availability import at_frames, available
+from thermal_fiducial.report.charts import clock_chart, error_charts
 from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.map_error import map_accuracy, marker_errors
 from thermal_fiducial.report.output_bag import Arrivals, RecordedOutput
@@ -45,6 +46,25 @@ def test_logarithmic_axes_have_whole_numbers_at_their_ticks():
     assert shown[1] == ('0.01', '0.03', '0.1', '0.3', '1', '3', '10', '30', '100', '300')
     assert shown[2][:3] == ('0.001', '0.01', '0.1')
     assert shown[3] is None
+
+
+def test_a_wide_band_at_the_beginning_does_not_hide_the_errors(tmp_path):
+    """Until map and clock offset are known, for a quarter of the time, three sigma are 60 mm and 90 ms; then 3 and 0.6.
+
+    Errors of a millimetre, and an offset of 5 ms that is known to 0.6 ms, were a flat line in such a plot.
+    """
+    evaluation = evaluate(run_of(tmp_path, trajectory(200.0), trajectory(30.0)))
+    stamps = evaluation.run.fused.stamps_ns[::200]
+    early = np.arange(len(stamps)) < len(stamps) // 4
+    covariances = np.eye(6) * np.where(early, 0.02, 0.001)[:, None, None] ** 2
+    offsets = {'time offset': np.full(len(stamps), 5e-3), 'time offset std': np.where(early, 0.03, 2e-4)}
+    figures = {name: (stamps, values) for name, values in (offsets | {'position std': offsets['time offset']}).items()}
+    output = RecordedOutput(stamps_ns=stamps, covariances=covariances, figures=figures)
+    evaluation = replace(evaluation, run=replace(evaluation.run, output=output))
+    (position, _), (clock,) = error_charts(evaluation), clock_chart(evaluation)
+    # A quarter more than the usual band.
+    assert position.figure.layout.yaxis.range == pytest.approx((-3.75, 3.75))
+    assert clock.figure.layout.yaxis.range == pytest.approx((5.0 - 0.75, 5.0 + 0.75))
 
 
 # --- as available ------------------------------------------------------------------------------------
