@@ -649,3 +649,14 @@ def test_labels_of_a_drawing_of_one_wall_stand_apart(poses):
         shown = sorted((box for box in boxes if low <= box.x0 + box.width / 2 <= high), key=lambda box: box.x0)
         assert shown
         assert all(left.x1 < right.x0 for left, right in pairwise(shown))
+
+
+@pytest.mark.parametrize(('sigma', 'scale'), [(1e-3, ' enlarged 20 times'), (0.05, ' enlarged 2 times'), (0.5, '')])
+def test_ellipses_of_a_drawing_leave_its_markers_to_be_seen(poses, sigma, scale):
+    """A map from photos of a room, known to 6 cm: ellipses enlarged 20 times were 7 m wide, all over the drawing."""
+    places = [[4.0, 0.8 * k, 0.0] for k in range(6)]
+    markers = {
+        k: MapMarker(k, 0.3, False, transform(poses[2][:3, :3], place), covariance=sigma**2 * np.eye(6))
+        for k, place in enumerate(places)
+    }
+    assert draw_map(MarkerMap(markers)).legends[0].get_title().get_text().endswith(f'three sigma{scale}')
