@@ -44,7 +44,7 @@ def scene_chart(evaluation: Evaluation) -> list[Chart]:
         template='none',
         height=620,
         margin={'l': 0, 'r': 0, 't': 0, 'b': 0},
-        legend={'x': 0.0, 'y': 1.0},
+        legend={'x': 0.0, 'y': 1.0, 'itemsizing': 'constant'},
         scene={**axes, 'aspectmode': 'data', 'camera': _CAMERA},
     )
     text = (

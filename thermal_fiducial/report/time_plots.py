@@ -66,7 +66,7 @@ class TimePlots:
             template='none',
             height=ROW_PX * max(rows, 2) + AROUND_PX,
             margin={'l': 62, 'r': 14, 't': 30, 'b': 44},
-            legend={'orientation': 'h', 'yanchor': 'bottom', 'y': 1.0, 'x': 0.0},
+            legend={'orientation': 'h', 'yanchor': 'bottom', 'y': 1.0, 'x': 0.0, 'itemsizing': 'constant'},
             hovermode='x unified',
         )
         for row, label in enumerate(labels, 1):

@@ -268,6 +268,12 @@ def test_the_navigation_marks_where_one_reads(run_folder, tmp_path, height, mark
     assert found[1] == marked
 
 
+def test_dots_of_a_legend_are_large_enough_to_show_their_colour(page):
+    """Dots of 3.5 pixels, as in the plots, looked alike in red, blue and violet."""
+    for figure in figures(page).values():
+        assert figure['layout']['legend']['itemsizing'] == 'constant'
+
+
 def test_a_number_and_its_percent_sign_are_not_parted(page):
     cells = [cell for cell in re.findall(r'<td[^>]*>([^<]*)</td>', page) if '%' in cell]
     assert cells
