@@ -20,6 +20,8 @@ from thermal_fiducial.report.frames import annotated, view_at
 
 #: Number of colours of the PNG; few keep it small for a README.
 COLOURS = 160
+#: Least error drawn on the logarithmic axis [mm].
+_AXIS_FROM_MM = 0.1
 FIDUCIAL, FUSED, TRUTH, INK, FAINT = '#e5484d', '#2563eb', '#64748b', '#0f172a', '#64748b'
 STYLE: Any = {
     'font.size': 9,
@@ -68,7 +70,7 @@ def draw_picture(evaluation: Evaluation, bag: Path, path: Path) -> None:
         found = int(np.sum(evaluation.run.detections.stamps_ns == stamp_ns))
         frame.set_title(f'What the thermal camera sees: {number_of(found, "marker")} found')
         _draw_map(above, evaluation)
-        _draw_error(error, evaluation)
+        draw_error(error, evaluation)
         buffer = io.BytesIO()
         figure.savefig(buffer, format='png', facecolor='white')
     try:
@@ -105,16 +107,20 @@ def _draw_map(axis: Axes, evaluation: Evaluation) -> None:
     axis.legend(loc='upper left', fontsize=7.5, borderaxespad=0.1)
 
 
-def _draw_error(axis: Axes, evaluation: Evaluation) -> None:
-    """Errors as seen by a controller, or at each pose's stamp if arrival times are unknown."""
+def draw_error(axis: Axes, evaluation: Evaluation) -> None:
+    """Errors as seen by a controller, or at each pose's stamp if arrival times are unknown; the legend above them."""
     axis.set(title='Error against ground truth', xlabel='time [s]', ylabel='position error [mm]')
+    largest = 0.0
     for name, colour, t, error in _errors(evaluation):
         rms = float(np.sqrt(np.mean(error**2)))
         axis.plot(t, error, '.', color=colour, markersize=1.5, label=f'{name}: {rms:.1f} mm rms')
+        largest = max(largest, float(np.nanmax(error)))
     if axis.get_legend_handles_labels()[0]:
         axis.set_yscale('log')
-        axis.set_ylim(bottom=0.1)
-        axis.legend(loc='lower right', markerscale=5, frameon=True, framealpha=0.9, edgecolor='none')
+        # A decade above the errors has room for the two rows of the legend.
+        axis.set_ylim(_AXIS_FROM_MM, 10.0 * max(largest, _AXIS_FROM_MM))
+        axis.yaxis.set_major_formatter('{x:g}')
+        axis.legend(loc='upper left', markerscale=5, frameon=False)
 
 
 def _errors(evaluation: Evaluation) -> list[tuple[str, str, FloatArray, FloatArray]]:

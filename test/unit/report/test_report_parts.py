@@ -3,6 +3,8 @@
 from dataclasses import replace
 import re
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 import numpy as np
 import pytest
 from support.run_folders import (
@@ -27,6 +29,7 @@ from thermal_fiducial.report.charts import clock_chart, error_charts
 from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.map_error import map_accuracy, marker_errors
 from thermal_fiducial.report.output_bag import Arrivals, RecordedOutput
+from thermal_fiducial.report.picture import draw_error
 from thermal_fiducial.report.run_folder import read_run
 from thermal_fiducial.report.table import Table
 from thermal_fiducial.report.tags import tags
@@ -65,6 +68,20 @@ def test_a_wide_band_at_the_beginning_does_not_hide_the_errors(tmp_path):
     # A quarter more than the usual band.
     assert position.figure.layout.yaxis.range == pytest.approx((-3.75, 3.75))
     assert clock.figure.layout.yaxis.range == pytest.approx((5.0 - 0.75, 5.0 + 0.75))
+
+
+def test_the_legend_of_the_summary_picture_covers_no_error(tmp_path):
+    """In the lower right corner it hid the best third of the fused errors, which go on below it."""
+    evaluation = evaluate(run_of(tmp_path, trajectory(200.0), trajectory(30.0)))
+    figure = Figure(figsize=(4.4, 4.3))
+    axis = figure.subplots()
+    draw_error(axis, evaluation)
+    FigureCanvasAgg(figure).draw()
+    legend = axis.get_legend().get_window_extent()
+    assert axis.get_ylim()[1] > axis.transData.inverted().transform((0.0, legend.y0))[1]
+    for line in axis.get_lines():
+        assert len(line.get_ydata())
+        assert axis.transData.transform((0.0, np.nanmax(line.get_ydata())))[1] < legend.y0
 
 
 # --- as available ------------------------------------------------------------------------------------
