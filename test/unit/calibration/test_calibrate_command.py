@@ -23,6 +23,8 @@ from support.small_bag import (
 )
 import yaml
 
+from thermal_fiducial.calibration import camera_imu
+from thermal_fiducial.calibration.camera_imu import CameraImuCalibration
 from thermal_fiducial.calibration.targets import Chessboard
 from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.board_views import BoardViews
@@ -70,6 +72,23 @@ def test_camera_against_imu(tmp_path, capsys):
         max([*left_deg, np.degrees(0.002)]), abs=1e-4
     )
     assert 'turns about all three axes' in printed.err
+
+
+def test_one_pose_far_off_does_not_make_the_error_that_is_printed(tmp_path, capsys, monkeypatch):
+    """Of 431 poses 0.1 mm off, one, of a marker taken for its mirror image, 2.2 m: an "rms" of 105 mm was printed."""
+    residuals = np.zeros((431, 6))
+    residuals[:, 0] = 1e-4
+    residuals[274, 0] = 2.188
+    found = CameraImuCalibration(
+        T_BODY_CAMERA, 0.0, 1e-8 * np.eye(7), 0.0, 1e-4, 0.0, np.zeros(3), np.zeros(6), np.zeros(15), np.zeros(15),
+        residuals, len(residuals), 1.0,
+    )  # fmt: skip
+    monkeypatch.setattr(camera_imu, 'calibrate_rolling_camera_imu', lambda *_: found)
+    bag = recording(seconds=1.0).write(tmp_path / 'bag')
+    marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
+    words = ['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--out', str(tmp_path / 'extrinsics.yaml')]
+    assert main(words) == 0
+    assert '# 431 camera poses, off the motion by 0.10 mm in the median, 2188.00 mm at worst' in capsys.readouterr().out
 
 
 def with_corners_instead_of_images(images, marker_map):
