@@ -119,7 +119,7 @@ def marker_drawing(bits: Gray, label: str, options: PlateOptions) -> Drawing:
     pattern = [_moved(r, origin) for r in marker_rectangles(bits, options)]
     contours = trace([*outline, *pattern])
     points, side = mounting_points(options, cells)
-    spacers = f'{len(points)} spacers of {options.stand_off:g} mm, holes of {options.hole_diameter:g} mm'
+    spacers = f'; {len(points)} spacers of {options.stand_off:g} mm, holes of {options.hole_diameter:g} mm'
     holes = (Circle(x, y, 0.5 * (options.hole_diameter - options.kerf)) for x, y in (points + 0.5 * side).tolist())
     return Drawing(
         name=label,
@@ -128,7 +128,7 @@ def marker_drawing(bits: Gray, label: str, options: PlateOptions) -> Drawing:
         cuts=tuple(contour(corners, options.kerf, options.corner_radius) for corners in contours),
         holes=tuple(holes),
         engraving=tuple(engraving),
-        notes=(f'{label}: black square {options.size:g} mm, kerf {options.kerf:g} mm; {spacers}',),
+        notes=(f'{label}: black square {options.size:g} mm, kerf {options.kerf:g} mm{spacers if len(points) else ""}',),
     )
 
 

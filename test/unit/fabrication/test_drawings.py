@@ -440,6 +440,15 @@ def test_nothing_is_written_where_one_file_exists(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ['marker-3.dxf']
 
 
+def test_a_plate_without_mount_has_no_spacers(tmp_path, capsys):
+    """It was said to have "0 spacers of 10 mm, holes of 4.3 mm"."""
+    words = ['markers', 'make', '--ids', '0', '--formats', 'svg', '--out', str(tmp_path)]
+    assert main([*words, '--mount', 'none']) == 0
+    assert 'spacers' not in capsys.readouterr().out
+    assert main([*words, '--force']) == 0
+    assert '; 4 spacers of 10 mm, holes of 4.3 mm' in capsys.readouterr().out
+
+
 def test_a_marker_that_is_named_twice_is_drawn_once(tmp_path, capsys):
     arguments = ['--ids', '2-3,3,2', '--size', '120', '--formats', 'svg', '--out', str(tmp_path)]
     assert main(['markers', 'make', *arguments]) == 0
