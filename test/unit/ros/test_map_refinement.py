@@ -13,6 +13,7 @@ from support.walls import CAMERA, flight, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.ros.mapper_node.map_refinement import MapRefinement
@@ -49,6 +50,17 @@ def errors_mm(marker_map, poses):
 @pytest.fixture
 def poses():
     return wall(np.random.default_rng(3))
+
+
+@pytest.mark.parametrize('live', [False, True])
+def test_a_mapper_without_frames_has_nothing_to_refine(poses, live):
+    """It said that a refinement was under way, for as long as no frame came: its process counts as busy until then."""
+    refinement = MapRefinement(MarkerMapper(MarkerMapperConfig(), first_map(poses)), live=live)
+    try:
+        with pytest.raises(InputError, match='nothing to refine yet'):
+            refinement.start()
+    finally:
+        refinement.close()
 
 
 @pytest.mark.parametrize('live', [False, True])

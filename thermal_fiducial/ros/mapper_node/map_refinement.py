@@ -54,10 +54,13 @@ class MapRefinement:
         """
         if self._mapper.frozen or self._worker is None:
             raise InputError('the map is frozen')
+        snapshot = self._mapper.snapshot()
+        if snapshot is None:
+            raise InputError('nothing to refine yet')
+        # So is a process that starts, until the first frame.
         if self._worker.busy:
             raise InputError('a refinement is under way')
-        if not self._begin(self._worker):
-            raise InputError('nothing to refine yet')
+        self._worker.start(snapshot)
 
     def finish(self, seconds: float) -> bool:
         """Refine the map of a flight that has ended, with its last keyframes, if ``seconds`` are enough.
