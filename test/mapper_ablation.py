@@ -87,6 +87,11 @@ MECHANISMS = {
         ('localization:_widened',),
         {'localization:_widened': lambda found, _: found},
     ),
+    'what corners add to odometry': Mechanism(
+        ('from the front', 'small markers'),
+        ('localization:_by_odometry',),
+        {'localization:_by_odometry': lambda _, found, *__: found},
+    ),
     'error of the aspect ratio': Mechanism(
         ('board', 'surveyed board'), (), {'mapper:SystematicErrors': partial(SystematicErrors, aspect=0.0)}
     ),
@@ -133,7 +138,7 @@ MECHANISMS = {
     'joint draws of the map': Mechanism(
         ('bent corridor', 'wall', 'uneven map'),
         ('error_sources:ErrorSources._noise', 'error_sources:ErrorSources._solved'),
-        {'localization:drawn_sum': _independent},
+        {'joint_fit:drawn_sum': _independent},
     ),
     'priors': Mechanism(
         ('second flight', 'chain'), ('keyframes:prior_poses',), {'keyframes:prior_poses': lambda *_: {}}

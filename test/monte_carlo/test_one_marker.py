@@ -1,0 +1,70 @@
+"""A robot that hovers before one small marker, through mapper and filter."""
+
+import numpy as np
+import pytest
+from support.flights import CAMERA_ORIENTATION, CAMERA_POSITION, IMU, in_order, Motion, START_NS, T_BODY_CAMERA
+from support.walls import CAMERA, see, SIZE
+
+from thermal_fiducial.config import MarkerMapperConfig, PoseEkfConfig
+from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.geometry.se3 import so3_log, transform
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.core.motion_prior import MotionPrior
+
+SECONDS, DELAY_NS = 6.0, 30_000_000
+RIG = {'camera_position': CAMERA_POSITION, 'camera_orientation': CAMERA_ORIENTATION}
+
+
+def nees_before(distance, seed):
+    """NEES a degree of freedom of each pose that is not lost, before a marker that is seen from the front."""
+    rng = np.random.default_rng(seed)
+    motion = Motion.random(rng, speed=0.1, turn=0.05)
+    T_camera_marker = transform(np.diag([1.0, -1.0, -1.0]), [*0.1 * rng.normal(size=2), distance])
+    poses = {0: motion.pose(0.0) @ T_BODY_CAMERA @ T_camera_marker}
+    mapper = MarkerMapper(
+        MarkerMapperConfig(mode='localization', marker_size=SIZE, **RIG),
+        MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}),
+    )
+    ekf, odometry, nees = PoseEkf(PoseEkfConfig(imu=IMU, **RIG)), MotionPrior(), []
+    densities = np.repeat((IMU.gyroscope_noise_density, IMU.accelerometer_noise_density), 3)
+    for stamp_ns, is_frame in instants():
+        t = (stamp_ns - START_NS) * 1e-9
+        if is_frame:
+            rows = see(motion.pose(t) @ T_BODY_CAMERA, poses, 0.1, rng)
+            pose = mapper.process(stamp_ns, rows, CAMERA, odometry).pose
+            if pose is not None:
+                ekf.add_pose(pose)
+            if ekf.camera_time_offset is not None:
+                odometry.set_clock_offset(ekf.camera_time_offset)
+            continue
+        imu = motion.imu(t) + densities * np.sqrt(200.0) * rng.normal(size=6)
+        state = ekf.add_imu(ImuSample(stamp_ns, imu[:3], imu[3:]))
+        if state is None:
+            continue
+        odometry.add(state.stamp_ns, state)
+        truth = motion.pose(t)
+        turn = so3_log(truth[:3, :3] @ state.T_map_body[:3, :3].T)
+        error = np.concatenate((truth[:3, 3] - state.T_map_body[:3, 3], turn))
+        if not ekf.lost:
+            nees.append(error @ np.linalg.solve(state.pose_covariance, error) / 6.0)
+    return nees
+
+
+def instants():
+    """Stamps of the samples at 200 Hz and of the frames at 30 Hz, which come late, in the order of their arrival."""
+    samples = [START_NS + 5_000_000 * k for k in range(round(200 * SECONDS))]
+    frames = [START_NS + round(k * 1e9 / 30.0) for k in range(round(30 * SECONDS))]
+    arrivals = [(stamp, 0, (stamp, False)) for stamp in samples]
+    return in_order(arrivals + [(stamp + DELAY_NS, 1, (stamp, True)) for stamp in frames])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('distance', 'limit'), [(5.0, 1.2), (8.0, 3.0)])
+def test_a_marker_from_the_front_confirms_no_error_of_the_odometry(distance, limit):
+    """32 and 20 px. NEES is 0.4 and 0.9; with the fit to the corners alone it was 2.5 and 15."""
+    nees = [value for seed in range(3) for value in nees_before(distance, seed)]
+    assert len(nees) > 500
+    # Errors last for the whole flight, so three flights are three draws: three times what was measured.
+    assert np.mean(nees) < limit
