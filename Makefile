@@ -38,7 +38,7 @@ help:
 
 $(READY): setup.py
 	@echo '== Setting up $(VENV) with $(PYTHON): about 500 MB of packages, once'
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or 3.12 is needed: make PYTHON=python3.12")'
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)) and "Python 3.11 or 3.12 is needed: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip 'setuptools<80' wheel
 	$(QUIET_PIP) $(BIN)/python -m pip install --progress-bar on --quiet --editable '.[ros,tools,batch,test,lint,colcon]'
