@@ -99,7 +99,9 @@ def _are_confirmed(
     keep &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
     doubtful = np.flatnonzero(keep & (markers.observed.doubt > 0.0))
     if len(doubtful):
-        variance = markers.observed.mean_variance[doubtful]
+        # By the noise of the pixels alone: a pattern that is none leaves more, and that would excuse the outline.
+        own = np.minimum(frame.noise / markers.observed.noise[doubtful], 1.0) ** 2
+        variance = own * markers.observed.mean_variance[doubtful]
         keep[doubtful] = _square(ImagePoints.at(corners[doubtful], frame.camera), variance, decoder.cells)
     return np.asarray(keep)
 
