@@ -21,11 +21,11 @@ from thermal_fiducial.core.filter.hypotheses import (
     weigh,
 )
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
-from thermal_fiducial.core.filter.initialization import no_gravity, WINDOW_SECONDS
+from thermal_fiducial.core.filter.initialization import TWO_POSES, WINDOW_SECONDS
 from thermal_fiducial.core.filter.propagation import propagated, random_walks
 from thermal_fiducial.core.filter.state import Estimate
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
-from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.measurements import CameraPose, Condition
 from thermal_fiducial.core.types import SECOND_NS
 
 #: A propagated belief is kept at this interval [ns], so that a pose begins there and not at the pose before.
@@ -247,9 +247,10 @@ class History:
         time_ns = max(self.due_ns(pose, None, belief.first_offset), self.imu.oldest_ns)
         window = self.imu.window(time_ns, WINDOW_SECONDS)
         begun = first_hypothesis(self.config, pose, time_ns, window, belief.first_offset)
-        if begun is None:
-            refused = PoseUpdate(pose.stamp_ns, False, 'refused: contradicts gravity', math.nan)
-            return belief._replace(contradiction=no_gravity(window), verdict=refused)
+        if isinstance(begun, Condition):
+            why = 'two poses are possible' if begun is TWO_POSES else 'contradicts gravity'
+            refused = PoseUpdate(pose.stamp_ns, False, f'refused: {why}', math.nan)
+            return belief._replace(contradiction=begun, verdict=refused)
         return belief._replace(alternative=begun).settled(self.config)
 
     def _with_alternative(self, belief: Belief, main: Hypothesis, refused: Innovation) -> Belief:

@@ -70,8 +70,8 @@ def passes_with_unknown_clock(config: PoseEkfConfig, innovation: Innovation) -> 
 
 def first_hypothesis(
     config: PoseEkfConfig, pose: CameraPose, time_ns: int, window: FloatArray, time_offset: float
-) -> Hypothesis | None:
-    """A hypothesis initialised from a pose without prior; None where the pose contradicts gravity.
+) -> Hypothesis | Condition:
+    """A hypothesis initialised from a pose without prior, or why none begins with it.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def first_hypothesis(
     blank = replace(blank_state(config), time_offset=time_offset)
     measured = body_pose(pose, blank.T_body_camera, config.pose_noise_scale)
     estimate = start(config, measured, time_ns, blank, window)
-    return None if estimate is None else Hypothesis(estimate, time_ns, time_ns)
+    return estimate if isinstance(estimate, Condition) else Hypothesis(estimate, time_ns, time_ns)
 
 
 def relinearises(begun: Hypothesis, first_offset: float) -> bool:
@@ -94,7 +94,7 @@ def relinearises(begun: Hypothesis, first_offset: float) -> bool:
 def alternative_to(
     config: PoseEkfConfig, main: Hypothesis, innovation: Innovation, window: FloatArray
 ) -> Hypothesis | None:
-    """A hypothesis initialised from a pose that ``main`` refuses; None where the pose contradicts gravity.
+    """A hypothesis initialised from a pose that ``main`` refuses; None where nothing begins with it.
 
     Position and attitude are those of the pose; biases, scale errors and extrinsics are those of ``main``. The clock
     offset is as uncertain as the parameter says where that explains why the pose is refused, else as that of ``main``.
@@ -108,7 +108,7 @@ def alternative_to(
         known = math.hypot(estimate.std(TIME_OFFSET), KNOWN_OFFSET_STD)
         config = replace(config, time_offset_std=min(config.time_offset_std, known))
     begun = start(config, innovation.pose, estimate.stamp_ns, estimate.state, window)
-    if begun is None:
+    if isinstance(begun, Condition):
         return None
     needed = min(main.hits, _ENOUGH_POSES) if _is_far(config, innovation) else 0
     return Hypothesis(begun, estimate.stamp_ns, estimate.stamp_ns, needed=needed)

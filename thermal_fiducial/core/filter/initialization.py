@@ -29,7 +29,14 @@ from thermal_fiducial.core.filter.state import (
     SYSTEMATIC,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry.se3 import camera_in_body, inverse
+from thermal_fiducial.core.geometry.se3 import (
+    camera_in_body,
+    inverse,
+    skew,
+    so3_exp,
+    so3_left_jacobian,
+    transform,
+)
 from thermal_fiducial.core.measurements import CameraPose, Condition
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -40,6 +47,14 @@ WINDOW_SECONDS = 0.5
 HARDLY_GRAVITY = 0.5
 #: Largest angle [rad] between a first pose's vertical and the specific force: beyond it the planar branch is wrong.
 LARGEST_TILT = math.radians(35.0)
+#: Standard deviation of the attitude [rad] beyond which nothing begins with a pose: it may be one of two.
+VAGUE = 0.2
+#: Standard deviation of the vertical by the mean of half a second of samples [rad]: the robot accelerates by 1 m/s^2.
+_VERTICAL_STD = 0.1
+#: Gauss-Newton steps, as two poses may be 60 degrees apart.
+_STEPS = 5
+#: Why nothing begins with a vague pose.
+TWO_POSES = Condition('two poses are possible', 'gravity does not show which one; move, or show another marker')
 #: Longest time [s] for which the last pose still limits where the robot can be.
 HINT_SECONDS = 10.0
 #: Largest distance of the robot from its last pose: a constant [m] and a speed [m/s].
@@ -66,8 +81,8 @@ def blank_state(config: PoseEkfConfig) -> NavigationState:
 
 def start(
     config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: NavigationState, imu: FloatArray
-) -> Estimate | None:
-    """Estimate at a first pose; None where pose or specific force contradict gravity.
+) -> Estimate | Condition:
+    """Estimate at a first pose, or why nothing begins with it: two are possible, or it contradicts gravity.
 
     Parameters
     ----------
@@ -75,8 +90,12 @@ def start(
     prior : state that gives biases, scale errors, gravity, clock offset and extrinsics
     imu : (N, 6) samples up to the pose's instant, the last one at that instant
     """
+    settled = settled_by_gravity(pose, imu)
+    if settled is None:
+        return TWO_POSES
+    pose = settled
     if _contradicts_gravity(pose, imu, config.gravity):
-        return None
+        return no_gravity(imu)
     noise = PoseNoise.of(pose, config.stamp_jitter, config.mount_vibration)
     P = np.diag(_initial_variances(config))
     P[SYSTEMATIC, SYSTEMATIC] = config.systematic_pose_std**2 * pose.shape
@@ -98,6 +117,32 @@ def start(
     if config.estimate_time_offset:
         P += _of_unknown_clock(config, state, imu[-1])
     return Estimate(stamp_ns, state, P, pose_noise=noise)
+
+
+def settled_by_gravity(pose: BodyPose, imu: FloatArray) -> BodyPose | None:
+    """A first pose, if its attitude is vague with the vertical by the samples; None if it stays vague.
+
+    Before one small marker two poses are possible, and the covariance has both. Where they differ in tilt, the vertical
+    shows which it is; where they differ in heading, it does not.
+
+    Parameters
+    ----------
+    imu : (N, 6) samples up to the pose's instant
+    """
+    if math.sqrt(pose.covariance[:3, :3].trace()) <= VAGUE:
+        return pose
+    force = imu.mean(axis=0)[3:]
+    P, T, error, H = pose.covariance, pose.T_map_body, np.zeros(6), np.zeros((3, 6))
+    for _ in range(_STEPS):
+        up = T[2, :3]
+        H[:, :3] = skew(up)
+        gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + _VERTICAL_STD**2 * np.eye(3))
+        error = gain @ (force / np.linalg.norm(force) - up + H @ error)
+        turn = error[:3]
+        T = pose.T_map_body @ transform(so3_exp(turn), so3_left_jacobian(turn) @ error[3:])
+    P = (np.eye(6) - gain @ H) @ P
+    known = math.sqrt(P[:3, :3].trace()) <= VAGUE
+    return replace(pose, T_map_body=T, covariance=0.5 * (P + P.T)) if known else None
 
 
 def _contradicts_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import covariance_of_one_error, decision_weights, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit
-from thermal_fiducial.core.geometry.reprojection import difference, screw_difference, turned
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, screw_difference
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
 from thermal_fiducial.core.mapping.joint_fit import Alternative, DECISIVE, JointFit, SurveyedFit
 from thermal_fiducial.core.mapping.located import Location, Refusal, Sight, VAGUE
@@ -93,10 +93,14 @@ def _by_odometry(frame: JointFit, found: Location, other: Alternative | None, od
         excess = cost - ends[0][0]
         if excess < DECISIVE and rotation_angle(T[:3, :3].T @ ends[0][1][:3, :3]) > SAME_POSE:
             # Odometry must not settle it twice, in the mapper and in the filter.
-            apart = screw_difference(T, location.pose.T_map_camera)
-            unknown = NOTHING_KNOWN / np.linalg.norm(apart[3:])
-            location = _with_spread(location, covariance_of_one_error(apart, float(unknown)))
+            location = _without_turn_to(T, location)
     return location
+
+
+def _without_turn_to(T_other: FloatArray, found: Location) -> Location:
+    """A location that says nothing of the turn from it to another pose (4, 4)."""
+    apart = screw_difference(T_other, found.pose.T_map_camera)
+    return _with_spread(found, covariance_of_one_error(apart, NOTHING_KNOWN / float(np.linalg.norm(apart[3:]))))
 
 
 def _widened(found: Location, other: Alternative) -> Location:
@@ -114,9 +118,8 @@ def _widened(found: Location, other: Alternative) -> Location:
 def _with_other(found: Location, other: CameraPose, excess: float) -> Location:
     """A location that may be the ``other`` one, whose chi square is larger by ``excess``: the spread of the two."""
     T, T_other = found.pose.T_map_camera, other.T_map_camera
-    odds = 1.0 / (1.0 + math.exp(0.5 * excess))
-    # Its errors are the same in the camera.
-    of_other = odds * turned(other.covariance, T[:3, :3] @ T_other[:3, :3].T)
+    odds, to_found = 1.0 / (1.0 + math.exp(0.5 * excess)), lever_arm(T[:3, 3] - T_other[:3, 3])
+    of_other = odds * to_found @ other.covariance @ to_found.T
     return _with_spread(found, covariance_of_one_error(screw_difference(T_other, T), math.sqrt(odds)) + of_other)
 
 
@@ -127,7 +130,11 @@ def _with_spread(found: Location, spread: FloatArray) -> Location:
 
 
 def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPose | None) -> Location | Refusal:
-    """The likelier of two poses that the corners allow by the last frame, with the other one; refuse without a last."""
+    """The likelier of two poses that the corners allow by the last frame, with the other one.
+
+    Without a last frame the map learns nothing from it, and the pose says nothing of the turn between the two: the
+    filter has gravity.
+    """
     T = other.T_map_camera
     second = frame.refined(T, frame.sight.reprojected(frame.camera, T), found.weights)
     # One that hardly fits at all ends anywhere.
@@ -142,7 +149,9 @@ def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPo
     chi2 = frame.fit.costs(np.stack([found.pose.T_map_camera, second.pose.T_map_camera]))
     chi2 *= decision_weights(frame.sight.noise_px, frame.model).min()
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
-    return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both)
+    likelier, less_likely = (found, second) if chi2[0] <= chi2[1] else (second, found)
+    pose = _without_turn_to(less_likely.pose.T_map_camera, _with_other(likelier, less_likely.pose, 0.0)).pose
+    return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both, pose=pose)
 
 
 def _cost_of_turn(pose: CameraPose, last: CameraPose) -> float:

@@ -172,11 +172,12 @@ class MisplacedMarker:
 
 @dataclass(frozen=True)
 class Refusal:
-    """The reason, in words, for which a frame has no pose."""
+    """The reason, in words, for which a frame has no pose, or one of two."""
 
     reason: str
-    #: the two possible poses, where the reason is the planar ambiguity
+    #: where the reason is the planar ambiguity: the two possible poses, and one whose covariance has the other
     viewpoint: Viewpoint | None = None
+    pose: CameraPose | None = None
     #: where that is the reason
     misplaced: MisplacedMarker | None = None
 
@@ -198,11 +199,12 @@ class LocatedFrame:
     @property
     def pose(self) -> CameraPose | None:
         """To publish; None without one, or if its attitude is too uncertain."""
-        return None if isinstance(self.outcome, Refusal) or self.reason else self.outcome.pose
+        vague = self.reason and isinstance(self.outcome, Location)
+        return None if vague else self.outcome.pose
 
     @cached_property
     def reason(self) -> str:
-        """Why there is no pose to publish, in words; empty if there is one."""
+        """Why there is no pose to publish, or one of two, in words; else empty."""
         if isinstance(self.outcome, Refusal):
             return self.outcome.reason
         std = self.outcome.rotation_std

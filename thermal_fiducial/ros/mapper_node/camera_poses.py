@@ -83,7 +83,7 @@ class CameraPoses:
             return
         self._locator.use_map_of(self._mapper)
         result = self._locator.process(*clouds.stamped_markers(message), self._camera, self._node.odometry)
-        self._reason = result.reason
+        self._reason = '' if result.pose is not None else result.reason
         alone = None if result.pose is None else self._second.add_second(result.pose, self._node.odometry)
         if alone is not None:
             self._publish(alone)
