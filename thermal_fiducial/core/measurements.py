@@ -24,6 +24,9 @@ _F4 = '<f4'
 LATEST_NS = 1_000_000_000
 #: Standard deviation [rad] that a camera pose claims for turns of which it says nothing: any turn is possible.
 NOTHING_KNOWN = 3.0
+#: Standard deviation of a pose's attitude [rad] beyond which it is neither published nor begun with: a first-order
+#: covariance fails there, and it may be one of two.
+VAGUE = 0.2
 
 CORNER_FIELDS = tuple(f'{axis}{corner}' for corner in range(4) for axis in 'uv')
 CORNER_COVARIANCE_FIELDS = tuple(f'c{corner}{term}' for corner in range(4) for term in ('uu', 'uv', 'vv'))

@@ -37,8 +37,8 @@ from thermal_fiducial.core.geometry.se3 import (
     so3_left_jacobian,
     transform,
 )
-from thermal_fiducial.core.measurements import CameraPose, Condition
-from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.core.measurements import CameraPose, Condition, VAGUE
+from thermal_fiducial.core.types import FloatArray, SECOND_NS, TINY
 
 #: Window [s] of the samples that a first pose is compared with.
 WINDOW_SECONDS = 0.5
@@ -47,8 +47,6 @@ WINDOW_SECONDS = 0.5
 HARDLY_GRAVITY = 0.5
 #: Largest angle [rad] between a first pose's vertical and the specific force: beyond it the planar branch is wrong.
 LARGEST_TILT = math.radians(35.0)
-#: Standard deviation of the attitude [rad] beyond which nothing begins with a pose: it may be one of two.
-VAGUE = 0.2
 #: Standard deviation of the vertical by the mean of half a second of samples [rad]: the robot accelerates by 1 m/s^2.
 _VERTICAL_STD = 0.1
 #: Gauss-Newton steps, as two poses may be 60 degrees apart.
@@ -132,12 +130,13 @@ def settled_by_gravity(pose: BodyPose, imu: FloatArray) -> BodyPose | None:
     if math.sqrt(pose.covariance[:3, :3].trace()) <= VAGUE:
         return pose
     force = imu.mean(axis=0)[3:]
+    direction = force / max(float(np.linalg.norm(force)), TINY)
     P, T, error, H = pose.covariance, pose.T_map_body, np.zeros(6), np.zeros((3, 6))
     for _ in range(_STEPS):
         up = T[2, :3]
         H[:, :3] = skew(up)
         gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + _VERTICAL_STD**2 * np.eye(3))
-        error = gain @ (force / np.linalg.norm(force) - up + H @ error)
+        error = gain @ (direction - up + H @ error)
         turn = error[:3]
         T = pose.T_map_body @ transform(so3_exp(turn), so3_left_jacobian(turn) @ error[3:])
     P = (np.eye(6) - gain @ H) @ P

@@ -38,6 +38,16 @@ _UNKNOWN_TURN = NOTHING_KNOWN / 3.0
 _ROUNDING = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
 
 
+def displacement_of_body(T_map_body: FloatArray, arm: FloatArray) -> FloatArray:
+    """Map (6, 6) from a displacement in the map, position first, to that of the robot in its frame, rotation first.
+
+    ``arm`` (3,): from the displaced point to the robot, in the map [m].
+    """
+    turn = np.zeros((6, 6))
+    turn[:3, 3:] = turn[3:, :3] = T_map_body[:3, :3].T
+    return turn @ lever_arm(arm)
+
+
 @dataclass(frozen=True)
 class BodyPose:
     """A measured pose of the robot."""
@@ -56,9 +66,7 @@ class BodyPose:
     @cached_property
     def by_map(self) -> FloatArray:
         """(6, 6) its derivative by a motion of the map about its origin, in the conventions of ``covariance``."""
-        turn = np.zeros((6, 6))
-        turn[:3, 3:] = turn[3:, :3] = self.T_map_body[:3, :3].T
-        return turn @ lever_arm(self.T_map_body[:3, 3])
+        return displacement_of_body(self.T_map_body, self.T_map_body[:3, 3])
 
     def after(self, last: 'BodyPose', T_map_body: FloatArray) -> 'BodyPose':
         """It as the ``last`` pose of the next one, seen from ``T_map_body`` of the estimate.

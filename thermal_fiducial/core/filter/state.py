@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
-from thermal_fiducial.core.geometry.reprojection import lever_arm
+from thermal_fiducial.core.geometry.reprojection import lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_left_jacobian, transform
 from thermal_fiducial.core.types import FloatArray
 
@@ -115,7 +115,7 @@ class NavigationState:
             time_offset=self.time_offset + float(error[TIME_OFFSET]),
             T_body_camera=T_body_camera,
             systematic=self.systematic + error[SYSTEMATIC],
-            T_map_markers=moved_map(error[MARKERS]) @ self.T_map_markers,
+            T_map_markers=retract(np.eye(4), error[MARKERS]) @ self.T_map_markers,
         )
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'NavigationState':
@@ -179,11 +179,6 @@ class Estimate:
         to_robot = lever_arm(self.state.position)[:3]
         of_map = to_robot @ self.pose_noise.last.map_covariance @ to_robot.T
         return math.hypot(self.std(POSITION), math.sqrt(float(of_map.trace())))
-
-
-def moved_map(motion: FloatArray) -> FloatArray:
-    """T_new_old (4, 4) by a motion (6,) of the map: position and rotation about its origin [m, rad]."""
-    return transform(so3_exp(motion[3:]), motion[:3])
 
 
 def embedded_core(error: FloatArray) -> FloatArray:

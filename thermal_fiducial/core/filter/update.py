@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
-from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_that_stays
+from thermal_fiducial.core.filter.pose_noise import BodyPose, displacement_of_body, PoseNoise, share_that_stays
 from thermal_fiducial.core.filter.state import (
     clock_offset_derivative,
     CORE,
@@ -18,7 +18,6 @@ from thermal_fiducial.core.filter.state import (
     EXTRINSICS,
     GRAVITY,
     MARKERS,
-    moved_map,
     NavigationState,
     POSE,
     POSITION,
@@ -28,7 +27,7 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry.reprojection import lever_arm
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian, so3_log
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
@@ -70,12 +69,7 @@ class Innovation(NamedTuple):
 def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> BodyPose:
     """Pose of the robot by a camera pose whose standard deviations are multiplied by ``scale``."""
     T_map_body = pose.T_map_camera @ inverse(T_body_camera)
-    R = T_map_body[:3, :3]
-    lever = T_map_body[:3, 3] - pose.T_map_camera[:3, 3]
-    # d p_body = d p_camera + d theta x lever, both in the map; then into the robot frame, rotation first.
-    J = np.zeros((6, 6))
-    J[:3, 3:] = J[3:, :3] = R.T
-    J[3:, 3:] = -R.T @ skew(lever)
+    J = displacement_of_body(T_map_body, T_map_body[:3, 3] - pose.T_map_camera[:3, 3])
     relative = scale**2 * (J @ (pose.covariance - pose.map_covariance) @ J.T)
     to_origin = lever_arm(-pose.T_map_camera[:3, 3])
     return BodyPose(T_map_body, relative, to_origin @ pose.map_covariance @ to_origin.T)
@@ -190,8 +184,7 @@ def _with_markers(estimate: Estimate, pose: BodyPose) -> Estimate:
     P[MARKERS] *= alike
     P[:, MARKERS] *= alike
     P[MARKERS, MARKERS] += (1.0 - alike**2) * pose.map_covariance
-    T = state.T_map_markers
-    kept = moved_map(alike * np.concatenate((T[:3, 3], so3_log(T[:3, :3]))))
+    kept = retract(np.eye(4), alike * difference(state.T_map_markers, np.eye(4)))
     return replace(estimate, state=replace(state, T_map_markers=kept), covariance=P)
 
 
@@ -256,6 +249,6 @@ def _iterated(innovation: Innovation, gain: FloatArray) -> FloatArray:
     Gauss-Newton method", IEEE TAC 1993.)
     """
     prior, error = innovation.prior.state, gain @ innovation.value
-    T_map_markers = moved_map(error[MARKERS]) @ prior.T_map_markers
+    T_map_markers = retract(np.eye(4), error[MARKERS]) @ prior.T_map_markers
     left = _unexplained(replace(prior.moved(error[CORE]), T_map_markers=T_map_markers), innovation.pose)
     return np.asarray(gain @ (left + error[POSE] + innovation.H[:, MARKERS] @ error[MARKERS]))

@@ -22,9 +22,9 @@ from thermal_fiducial.core.geometry.planar_pose import CameraFit, INLIER
 from thermal_fiducial.core.geometry.reprojection import lever_arm, retract, screw_difference, screwed
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.lens_errors import LensErrors
-from thermal_fiducial.core.mapping.located import Location, Reprojected, Sight, VAGUE
+from thermal_fiducial.core.mapping.located import Location, Reprojected, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE
-from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN
+from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
 from thermal_fiducial.core.types import FloatArray, TINY
 
 #: Difference of chi square that rules out the worse of two poses, or of two markers: odds of e^-10.

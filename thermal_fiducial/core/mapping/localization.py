@@ -15,9 +15,9 @@ from thermal_fiducial.core.geometry.planar_pose import CameraFit
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, screw_difference
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
 from thermal_fiducial.core.mapping.joint_fit import Alternative, DECISIVE, JointFit, SurveyedFit
-from thermal_fiducial.core.mapping.located import Location, Refusal, Sight, VAGUE
+from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
-from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN
+from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
 from thermal_fiducial.core.types import FloatArray
 
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.

@@ -18,12 +18,10 @@ from thermal_fiducial.core.geometry.reprojection import corners_in_map, differen
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
-from thermal_fiducial.core.measurements import CameraPose, Observations
+from thermal_fiducial.core.measurements import CameraPose, Observations, VAGUE
 from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked
 
-#: Standard deviation of the attitude [rad] beyond which a pose is not published: a first-order covariance fails there.
-VAGUE = 0.2
 #: Squared Mahalanobis distance (6 d.o.f.) beyond which markers and odometry contradict each other: ten sigma.
 CONTRADICTION = 100.0
 
@@ -175,7 +173,7 @@ class Refusal:
     """The reason, in words, for which a frame has no pose, or one of two."""
 
     reason: str
-    #: where the reason is the planar ambiguity: the two possible poses, and one whose covariance has the other
+    #: where the reason is the planar ambiguity: the two possible poses, and one vague in the turn between them
     viewpoint: Viewpoint | None = None
     pose: CameraPose | None = None
     #: where that is the reason

@@ -162,7 +162,7 @@ class MapperResult:
 
     stamp_ns: int
     pose: CameraPose | None
-    #: why there is no pose, or one whose covariance has another one, in words; else empty
+    #: why there is no pose, or one that says nothing of the turn to another one, in words; else empty
     reason: str
     #: whether the geometry of the map or its quarantine changed
     map_changed: bool = False

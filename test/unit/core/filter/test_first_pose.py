@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from support.flights import GRAVITY
 
-from thermal_fiducial.core.filter.initialization import settled_by_gravity, VAGUE
+from thermal_fiducial.core.filter.initialization import settled_by_gravity
 from thermal_fiducial.core.filter.pose_noise import BodyPose
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, so3_exp, so3_left_jacobian, transform
-from thermal_fiducial.core.measurements import NOTHING_KNOWN
+from thermal_fiducial.core.measurements import NOTHING_KNOWN, VAGUE
 
 
 def screw(axis, angle):

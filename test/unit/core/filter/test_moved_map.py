@@ -8,8 +8,7 @@ import pytest
 from support.flights import config, Flight
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.filter.state import moved_map
-from thermal_fiducial.core.geometry.reprojection import lever_arm
+from thermal_fiducial.core.geometry.reprojection import lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.measurements import in_moved_map
 
@@ -87,7 +86,7 @@ def test_a_map_that_moves_before_the_start_is_started_in():
 
 def with_poor_markers(pose, motion, std):
     """``pose`` by markers that a ``motion`` (6,) of the map displaces, each coordinate of it by one of ``std`` (6,)."""
-    T = moved_map(motion)
+    T = retract(np.eye(4), motion)
     arm = lever_arm(pose.T_map_camera[:3, 3])
     of_map = arm @ np.diag(std**2) @ arm.T
     return replace(pose, T_map_camera=T @ pose.T_map_camera, covariance=pose.covariance + of_map, map_covariance=of_map)

@@ -13,7 +13,6 @@ from thermal_fiducial.core.filter.state import (
     CORE,
     EXTRINSICS,
     MARKERS,
-    moved_map,
     POSE,
     POSITION,
     ROTATION,
@@ -31,6 +30,7 @@ from thermal_fiducial.core.filter.update import (
     mount_jacobian,
     pose_error,
 )
+from thermal_fiducial.core.geometry.reprojection import retract
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN
 
@@ -310,7 +310,7 @@ def test_the_map_has_the_same_error_while_its_covariance_is_the_same():
 def test_a_motion_of_the_map_moves_the_poses_of_its_markers(estimate):
     T, step = estimate.state.T_map_body, 1e-6
     for column, unit in enumerate(np.eye(6)):
-        moved = pose_error(estimate.state, moved_map(step * unit) @ T) / step
+        moved = pose_error(estimate.state, retract(np.eye(4), step * unit) @ T) / step
         # second order of the step
         np.testing.assert_allclose(moved, BodyPose(T, np.eye(6)).by_map[:, column], atol=1e-5)
 
