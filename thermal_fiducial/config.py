@@ -871,7 +871,7 @@ class ThermalSourceConfig(FrameParameters, ImageParameters):
     camera: str = param(
         '',
         'Source of the frames: a V4L2 device (/dev/video0), a TeAx ThermalGrabber ("teax", or "teax:SERIAL" if there '
-        'are several), or a folder or video of 16-bit pictures.',
+        'are several), or a folder, picture or video of 16 bits.',
         path=True,
     )
     image_width: int = param(0, 'Requested width; 0: as the camera is set.', unit='px', minimum=0, maximum=4096)
@@ -884,7 +884,7 @@ class ThermalSourceConfig(FrameParameters, ImageParameters):
         least=0.01,
         maximum=1000.0,
     )
-    repeat: bool = param(True, 'Restart a folder or video at its end.')
+    repeat: bool = param(True, 'Restart a folder, picture or video at its end.')
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from thermal_fiducial.calibration.preintegration import ImuTrack
@@ -16,14 +15,12 @@ from thermal_fiducial.core.types import Counts, FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.csv_rows import named_rows
-from thermal_fiducial.files.images import image_to_array, stamp_to_ns
-from thermal_fiducial.files.images import read_picture as load_picture
+from thermal_fiducial.files.images import image_to_array, PICTURE_SUFFIXES, pictures_in, stamp_to_ns
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.recordings import imu_samples
 
 #: Columns of a file of measured points; a header may hold more.
 POINT_COLUMNS = ('view', 'point', 'u', 'v', 'x', 'y')
-PICTURES = ('.png', '.tif', '.tiff', '.pgm', '.jpg', '.jpeg', '.bmp')
 _IMAGE_TYPE, _IMU_TYPE, _INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/CameraInfo'
 _COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 
@@ -57,26 +54,9 @@ def pictures(folder: Path) -> list[Path]:
     InputError
         There are none.
     """
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
-    if not paths:
-        raise InputError(f'{folder}: no pictures ({", ".join(PICTURES)}) and no bag')
-    return paths
-
-
-def read_picture(path: Path) -> Counts | Gray:
-    """Pixels (height, width) of 8 or 16 bit; colours are converted to grey.
-
-    Raises
-    ------
-    InputError
-        Not a picture of 8 or 16 bit.
-    """
-    image = load_picture(path, cv2.IMREAD_UNCHANGED)
-    if image.dtype not in (np.uint8, np.uint16) or min(image.shape[:2]) < 32:
-        raise InputError(f'{path}: a picture of {image.shape[1]}x{image.shape[0]} {image.dtype}, not 8 or 16 bit grey')
-    if image.ndim == 3:
-        image = cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY)
-    return image.astype(np.uint8) if image.dtype == np.uint8 else image.astype(np.uint16)
+    if paths := pictures_in(folder):
+        return paths
+    raise InputError(f'{folder}: no pictures ({", ".join(PICTURE_SUFFIXES)}) and no bag')
 
 
 def measured_points(path: Path, width: int, height: int) -> list[tuple[str, Sighting]]:

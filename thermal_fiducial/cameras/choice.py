@@ -26,7 +26,7 @@ def make_source(config: ThermalSourceConfig) -> FrameSource:
     if bool(config.image_width) != bool(config.image_height):
         raise InputError('parameters image_width and image_height: both or none')
     if not config.camera:
-        raise InputError('parameter camera: a device (/dev/video0), "teax", or a folder or video of pictures')
+        raise InputError('parameter camera: a device (/dev/video0), "teax", or a folder, picture or video')
     if kind == _TEAX:
         return ThermalGrabber(detail, size)
     if is_video_device(config.camera):

@@ -1,4 +1,4 @@
-"""Recorded 16-bit pictures in place of a camera: a folder (flirpy's, for instance) or a video."""
+"""Recorded 16-bit pictures in place of a camera: a folder (flirpy's, for instance), a file or a video."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -12,10 +12,9 @@ import numpy as np
 from thermal_fiducial.cameras.source import CapturedFrame, EndOfFramesError, now_ns
 from thermal_fiducial.core.types import Counts
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.images import read_picture, without_libraries_lines
+from thermal_fiducial.files.images import COUNTS_SUFFIXES, pictures_in, read_picture, without_libraries_lines
 from thermal_fiducial.files.reading import is_there, require_regular, shown
 
-_PICTURES = ('.png', '.tif', '.tiff', '.pgm')
 _STACKS = ('.tif', '.tiff')
 _PATIENCE_S = 0.2
 #: Pages of a TIFF in memory at a time: a flight has 10,000, of 655 KB each.
@@ -27,8 +26,8 @@ class Pictures:
 
     Parameters
     ----------
-    path : a folder of PNG, TIFF or PGM files, shown in the order of their names; a TIFF of many pages; or a video
-        whose codec keeps 16 bits (FFV1 with gray16le)
+    path : a folder of PNG, TIFF or PGM files, shown in the order of their names; one of them, a TIFF of many
+        pages for instance; or a video whose codec keeps 16 bits (FFV1 with gray16le)
     rate : pictures a second [Hz]
     repeat : begin again at the end
 
@@ -48,7 +47,7 @@ class Pictures:
         #: when the next picture is due, by the monotonic clock [s]
         self._due = 0.0
         if not is_there(self._path):
-            raise InputError(f'camera {shown(path)}: neither a device in /dev, nor "teax", nor a folder or video')
+            raise InputError(f'camera {shown(path)}: no device in /dev, "teax", folder, picture or video')
         if not any(True for _ in self._one_pass()):
             raise InputError(f'camera {path}: no 16-bit grey picture in it')
         self.events.clear()
@@ -83,22 +82,22 @@ class Pictures:
                 shown = self._repeat
 
     def _one_pass(self) -> Iterator[Counts]:
-        for picture in self._files() if self._path.is_dir() else self._video():
+        for picture in self._stored():
             if picture is not None and picture.dtype == np.uint16 and picture.ndim == 2:
                 yield np.asarray(picture, dtype=np.uint16)
             else:
                 self.events['unusable pictures'] += 1
 
-    def _files(self) -> Iterator[Any]:
-        for path in sorted(self._path.iterdir()):
-            if path.suffix.lower() in _PICTURES:
-                yield _picture(path)
+    def _stored(self) -> Iterator[Any]:
+        if self._path.is_dir():
+            return map(_picture, pictures_in(self._path, COUNTS_SUFFIXES))
+        require_regular(self._path)
+        suffix = self._path.suffix.lower()
+        if suffix in _STACKS:
+            return self._pages()
+        return map(_picture, [self._path]) if suffix in COUNTS_SUFFIXES else self._video()
 
     def _video(self) -> Iterator[Any]:
-        require_regular(self._path)
-        if self._path.suffix.lower() in _STACKS:
-            yield from self._pages()
-            return
         video = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         video.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         try:

@@ -13,12 +13,13 @@ from thermal_fiducial.calibration.lens_choice import choose_model
 from thermal_fiducial.calibration.plots import coverage
 from thermal_fiducial.calibration.recognition import BoardNotFound
 from thermal_fiducial.calibration.report import BoardView
-from thermal_fiducial.calibration.sources import clean_frames, pictures, RawFrame, read_picture
+from thermal_fiducial.calibration.sources import clean_frames, pictures, RawFrame
 from thermal_fiducial.calibration.targets import Sighting, Target
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
+from thermal_fiducial.files.images import read_gray
 
 # Least motion of the board since the last view kept of a bag, and largest motion until the next frame [px].
 _NEW_VIEW_PX, _STILL_PX = 12.0, 0.7
@@ -121,7 +122,7 @@ def look_at_pictures(source: Path, views: BoardViews, focal_px: float, most: int
         if len(views.kept) == most:
             return
         try:
-            counts = read_picture(path)
+            counts = read_gray(path)
         except InputError as reason:
             views.unusable.append((path.name, str(reason).removeprefix(f'{path}: ')))
             print(f'{path.name}: not used: {views.unusable[-1][1]}')

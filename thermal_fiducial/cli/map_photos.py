@@ -14,10 +14,9 @@ from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
 from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
-from thermal_fiducial.files.images import read_gray
+from thermal_fiducial.files.images import PICTURE_SUFFIXES, pictures_in, read_gray
 from thermal_fiducial.files.reading import naming, require_folder
 
-_IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
 #: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.
 PHOTO_SIGMA_PX = 0.2
 # Time between unordered pictures, so long that the detector assumes no continuous motion.
@@ -27,10 +26,9 @@ _APART_NS = 100_000_000_000
 def photos_in(folder: Path) -> list[Path]:
     """Pictures of a folder, sorted by name. Raises InputError if it has none."""
     require_folder(folder)
-    photos = sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGES)
-    if not photos:
-        raise InputError(f'{folder}: no photos ({", ".join(sorted(_IMAGES))})')
-    return photos
+    if photos := pictures_in(folder):
+        return photos
+    raise InputError(f'{folder}: no photos ({", ".join(PICTURE_SUFFIXES)})')
 
 
 def detect_in_photos(photos: list[Path], camera: Camera, args: argparse.Namespace) -> list[Markers]:

@@ -1,6 +1,6 @@
 """Pixels of ``sensor_msgs/msg/Image`` and ``CompressedImage``, from rclpy or from a bag."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
@@ -15,6 +15,9 @@ from thermal_fiducial.core.types import Counts, Gray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_bytes
 
+#: Files of pictures by their names: those that keep 16 bits, and all.
+COUNTS_SUFFIXES = ('.png', '.tif', '.tiff', '.pgm')
+PICTURE_SUFFIXES = (*COUNTS_SUFFIXES, '.jpg', '.jpeg', '.bmp')
 #: Accepted encodings to bytes per pixel.
 ENCODINGS = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 # Largest picture file: 33 megapixels of 16 bits, uncompressed, in colour.
@@ -85,6 +88,11 @@ def _is_cut_png(data: npt.NDArray[np.uint8]) -> bool:
     return begin > data.size
 
 
+def pictures_in(folder: Path, suffixes: Sequence[str] = PICTURE_SUFFIXES) -> list[Path]:
+    """Picture files of a folder in the order of their names."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes)
+
+
 def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
     """Pixels of a picture file, as :func:`cv2.imread` reads it.
 
@@ -117,7 +125,7 @@ def read_gray(path: str | Path) -> Counts | Gray:
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     pixels = read_picture(path, flags)
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise InputError(f'{path}: not a picture of 8 or 16 bit')
+        raise InputError(f'{path}: a picture of {pixels.dtype}, not of 8 or 16 bit')
     return pixels
 
 

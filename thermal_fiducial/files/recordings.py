@@ -20,6 +20,7 @@ from thermal_fiducial.core.measurements import CameraPose, ImuSample
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import csv_rows
+from thermal_fiducial.files.images import pictures_in
 from thermal_fiducial.files.reading import require_folder
 from thermal_fiducial.files.records import is_imu_reading
 from thermal_fiducial.files.rig_files import body_sensor, densities, of_camchain, of_rig, of_sensor, Rig
@@ -145,11 +146,8 @@ def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) 
     noise = imu or next((path for path in sorted(folder.glob('*imu*.yaml')) if path not in [chain, *chains]), None)
     known = {} if noise is None else densities(noise)
     place = folder / camera
-    pictures = [
-        Picture(_stamp(str(path), path.stem), path)
-        for path in sorted(place.glob('*'))
-        if path.suffix.lower() in ('.png', '.pgm', '.tif', '.tiff', '.jpg')
-    ]
+    require_folder(place)
+    pictures = [Picture(_stamp(str(path), path.stem), path) for path in pictures_in(place)]
     if not pictures:
         raise InputError(f'{place}: no pictures')
     pictures.sort(key=lambda picture: picture.stamp_ns)

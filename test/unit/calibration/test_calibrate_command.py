@@ -222,7 +222,7 @@ def test_unreadable_pictures_and_those_of_another_size_are_named(tmp_path, capsy
     cv2.imwrite(str(tmp_path / 'b.png'), counts[:200])
     (tmp_path / 'd.png').write_bytes(b'no picture')
     cv2.imwrite(str(tmp_path / 'e.png'), counts)
-    cv2.imwrite(str(tmp_path / 'f.tif'), np.zeros((256, 320, 3)))
+    cv2.imwrite(str(tmp_path / 'f.tif'), np.zeros((256, 320)))
     assert main(['calibrate', 'intrinsics', str(tmp_path), '--out', str(tmp_path / 'c.yaml')]) == 2
     out, err = capsys.readouterr()
     assert 'b.png: not used: 320x200 pixels, the views before it have 320x256' in out
@@ -232,7 +232,7 @@ def test_unreadable_pictures_and_those_of_another_size_are_named(tmp_path, capsy
     assert '2 of 5 frames are usable views' in err
     assert 'b.png: 320x200 pixels' in err
     assert 'd.png: not a readable picture' in err
-    assert 'f.tif: a picture of 320x256 float64, not 8 or 16 bit grey' in err
+    assert 'f.tif: a picture of float64, not of 8 or 16 bit' in err
 
 
 def test_reasons_that_differ_in_a_figure_are_one_in_the_error():

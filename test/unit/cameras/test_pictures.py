@@ -95,6 +95,17 @@ def test_a_stack_of_pictures_in_one_file(tmp_path):
         np.testing.assert_array_equal(frame.counts, expected)
 
 
+@pytest.mark.parametrize('suffix', ['png', 'PNG', 'pgm', 'tiff'])
+def test_a_single_picture(tmp_path, suffix):
+    path = str(tmp_path / f'one.{suffix}')
+    cv2.imwrite(path, PICTURES[0])
+    source = Pictures(path, 1000.0)
+    source.open()
+    for frame in shown(source, 2):
+        np.testing.assert_array_equal(frame.counts, PICTURES[0])
+    assert not source.events
+
+
 def test_a_video_of_16_bits(tmp_path):
     path = str(tmp_path / 'flight.mkv')
     settings = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
@@ -111,7 +122,7 @@ def test_a_video_of_16_bits(tmp_path):
 
 
 def test_what_is_no_source_is_refused(tmp_path):
-    with pytest.raises(InputError, match='neither a device'):
+    with pytest.raises(InputError, match='no device'):
         Pictures(str(tmp_path / 'nothing'))
     with pytest.raises(InputError, match='no 16-bit'):
         Pictures(str(tmp_path))

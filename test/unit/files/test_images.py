@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.images import header_stamp_ns, image_to_array, read_gray, stamp_to_ns
+from thermal_fiducial.files.images import (
+    COUNTS_SUFFIXES,
+    header_stamp_ns,
+    image_to_array,
+    PICTURE_SUFFIXES,
+    pictures_in,
+    read_gray,
+    stamp_to_ns,
+)
 
 PIXELS = np.array([[1, 2, 300], [4, 16383, 6]], np.uint16)
 
@@ -116,3 +124,19 @@ def test_pixels_of_a_photo_stay_where_the_sensor_has_them(tmp_path):
     for name, content in (('plain.jpg', data), ('marked.jpg', marked)):
         (tmp_path / name).write_bytes(content)
     np.testing.assert_array_equal(read_gray(tmp_path / 'marked.jpg'), read_gray(tmp_path / 'plain.jpg'))
+
+
+@pytest.mark.parametrize('suffix', PICTURE_SUFFIXES)
+@pytest.mark.parametrize('kind', [np.uint8, np.uint16])
+def test_pictures_of_a_folder_become_gray(tmp_path, suffix, kind):
+    """Colours of equal parts are the gray that they show; 16 bits stay where the format has them."""
+    keeps = suffix in COUNTS_SUFFIXES
+    gray = np.full((32, 48), 200, kind)
+    colour = gray if suffix == '.pgm' else np.dstack([gray] * 3)
+    cv2.imwrite(str(tmp_path / f'b{suffix.upper()}'), colour)
+    (tmp_path / 'a.txt').write_text('no picture')
+    (path,) = pictures_in(tmp_path)
+    pixels = read_gray(path)
+    np.testing.assert_array_equal(pixels, gray)
+    assert pixels.dtype == (kind if keeps else np.uint8)
+    assert bool(pictures_in(tmp_path, COUNTS_SUFFIXES)) == keeps

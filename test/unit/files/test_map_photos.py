@@ -99,7 +99,7 @@ def test_photos_of_temperatures_are_refused(photographed, tmp_path, capsys):
     cv2.imwrite(str(tmp_path / 'degrees.tiff'), temperatures)
     options = '--origin', 2, '--marker-size', SIZE, '--out', tmp_path / 'a.yaml'
     assert build((tmp_path, *photographed[1:]), *options) == 2
-    assert 'degrees.tiff: not a picture of 8 or 16 bit' in capsys.readouterr().err
+    assert 'degrees.tiff: a picture of float32, not of 8 or 16 bit' in capsys.readouterr().err
 
 
 def thermal_photos(folder, poses):
