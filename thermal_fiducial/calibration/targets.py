@@ -17,6 +17,7 @@ from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.fabrication.boards import LEAST_MARKERS
 
 _APART_NS = 10_000_000_000
 # Number of similar discs beyond the board that prove a larger grid; one or two may be clutter.
@@ -166,12 +167,19 @@ class MarkerBoard:
     ----------
     board : their map; markers in quarantine are left alone
     detector : of the dictionary of the map
+
+    Raises
+    ------
+    InputError
+        The map has fewer markers than a view needs.
     """
 
     radius = 0.0
 
     def __init__(self, board: MarkerMap, detector: Detector) -> None:
         self._markers = {key: marker for key, marker in board.markers.items() if marker.trusted}
+        if len(self._markers) < LEAST_MARKERS:
+            raise InputError(f'a board of {number_of(len(self._markers), "marker")}: calibration needs two or more')
         self._detector = detector
         self._stamp_ns = 0
 
@@ -181,7 +189,7 @@ class MarkerBoard:
         self._stamp_ns += _APART_NS
         rows = self._detector.detect(self._stamp_ns, counts, camera)
         rows = rows[np.isin(rows['id'], list(self._markers))]
-        if len(rows) < 2:
+        if len(rows) < LEAST_MARKERS:
             raise BoardNotFound(f'{number_of(len(rows), "marker")} of the board, of which two are needed')
         markers = [self._markers[marker_id] for marker_id in rows['id'].tolist()]
         T = np.stack([marker.T_map_marker for marker in markers])

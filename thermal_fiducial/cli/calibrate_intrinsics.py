@@ -174,7 +174,8 @@ def _target(args: argparse.Namespace) -> Target:
     if args.board is None:
         raise InputError('--target markers needs --board, the marker map of the board')
     board = load_map(args.board)
-    return MarkerBoard(board, mapped_detector(board, args.plate_thickness))
+    with naming(args.board):
+        return MarkerBoard(board, mapped_detector(board, args.plate_thickness))
 
 
 def _place(text: str) -> tuple[int, int]:

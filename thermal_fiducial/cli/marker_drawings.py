@@ -17,7 +17,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.fabrication.boards import base_plate, circle_board, marker_grid
+from thermal_fiducial.fabrication.boards import base_plate, circle_board, LEAST_MARKERS, marker_grid
 from thermal_fiducial.fabrication.drawing import Drawing
 from thermal_fiducial.fabrication.paper import check_paper, PAPERS
 from thermal_fiducial.fabrication.plate import marker_drawing, MOUNTS, PlateOptions
@@ -116,8 +116,9 @@ def _board(args: argparse.Namespace) -> int:
         _say_how_to_use(f'circles --grid {columns} {rows} --spacing {spacing:g} --diameter {args.diameter:g}')
         return 0
     bits = load_dictionary(args.dictionary).bits
-    if columns < 1 or rows < 1 or columns * rows > len(bits):
-        raise InputError(f'a board of {columns} x {rows} markers: {args.dictionary} has {len(bits)}')
+    if not LEAST_MARKERS <= columns * rows <= len(bits):
+        possible = f'calibration needs {LEAST_MARKERS} or more, {args.dictionary} has {len(bits)}'
+        raise InputError(f'a board of {columns} x {rows} markers: {possible}')
     labels = [str(index) for index in range(columns * rows)]
     centres = marker_grid(columns, rows, options.size, 40.0 if args.spacing is None else args.spacing)
     base = base_plate(centres, labels, bits.shape[1] + 2, options)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from support.boards import plate_pose, random_view, render
 
 from thermal_fiducial.calibration.intrinsics import calibrate
@@ -13,6 +14,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import MARKER_DTYPE
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import marker_grid
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.scenario import LENSES
@@ -82,3 +84,11 @@ def test_markers_in_quarantine_are_left_alone():
 
     camera = Camera(640, 512, LENSES['13mm'].matrix)
     assert len(MarkerBoard(marker_map, Seen()).find(np.zeros((512, 640), np.uint16), camera).points) == 8
+
+
+def test_a_board_of_one_marker_is_refused_before_any_view():
+    marker_map, _ = board()
+    alone = MarkerMap({0: marker_map.markers[0]}, dictionary=NAME)
+    detector = MarkerDetector(ArucoDetectorConfig(dictionary=NAME), load_dictionary(NAME))
+    with pytest.raises(InputError, match='a board of 1 marker: calibration needs two or more'):
+        MarkerBoard(alone, detector)

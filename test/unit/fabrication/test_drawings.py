@@ -410,6 +410,7 @@ def test_open_polyline_is_refused(tmp_path):
         ['sheet', '--sheet', '100', '100'],
         ['board', 'circles', '--diameter', '60'],
         ['board', 'markers', '--grid', '50', '50'],
+        ['board', 'markers', '--grid', '1', '1'],
     ],
 )
 def test_unusable_input_is_one_line(wrong, tmp_path, capsys):
