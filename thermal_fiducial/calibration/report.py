@@ -49,13 +49,29 @@ class BoardView:
     counts: Counts | Gray | None = None
 
 
+@dataclass(frozen=True)
+class LeftOut:
+    """A frame that is no view.
+
+    Parameters
+    ----------
+    name : as of a :class:`BoardView`
+    reason : why it is none
+    counts : the frame; None where it is not shown
+    """
+
+    name: str
+    reason: str
+    counts: Counts | Gray | None = None
+
+
 def write_report(
     path: Path,
     calibration: Calibration,
     views: Sequence[BoardView],
     fits: Mapping[str, Calibration],
     error: ImageError,
-    unusable: Sequence[tuple[str, str]] = (),
+    unusable: Sequence[LeftOut] = (),
 ) -> None:
     """Write the report.
 
@@ -63,21 +79,42 @@ def write_report(
     ----------
     views : all input views
     fits : the best of each model
-    unusable : name and reason of the frames without a sighting
+    unusable : the frames without a sighting
 
     Raises
     ------
     InputError
         The file can't be written.
     """
-    page = (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Calibration</title>'
-        f'<meta name="viewport" content="width=device-width,initial-scale=1"><style>{_STYLE}</style></head><body>'
-        f'<h1>Calibration</h1>{_overview(calibration, error)}{_numbers(calibration, fits)}'
-        f'{_drawings(calibration, views, error)}{_left_out(calibration, views, unusable)}'
-        f'<h2>Views</h2>{_view_figures(calibration, views)}</body></html>'
+    dropped = [LeftOut(views[index].name, 'fits far worse than the other views') for index in calibration.dropped]
+    body = (
+        f'{_overview(calibration, error)}{_numbers(calibration, fits)}{_drawings(calibration, views, error)}'
+        f'{_left_out([*dropped, *unusable])}<h2>Views</h2>{_view_figures(calibration, views)}'
     )
-    write_text(path, page)
+    write_text(path, _page('Calibration', body))
+
+
+def write_refusal(
+    path: Path, reason: str, size: tuple[int, int], views: Sequence[BoardView], unusable: Sequence[LeftOut]
+) -> None:
+    """Write why there is no calibration: the frames that are no views, and the views, of ``size`` (width, height).
+
+    Raises
+    ------
+    InputError
+        The file can't be written.
+    """
+    figures = [_figure(view, '', f'{len(view.sighting.pixels)} points', size) for view in views]
+    body = f'<p>{escape(reason)}</p>{_left_out(unusable)}<h2>Views</h2><div class="views">{"".join(figures)}</div>'
+    write_text(path, _page('Calibration refused', body))
+
+
+def _page(title: str, body: str) -> str:
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f'<meta name="viewport" content="width=device-width,initial-scale=1"><style>{_STYLE}</style></head><body>'
+        f'<h1>{title}</h1>{body}</body></html>'
+    )
 
 
 def _overview(calibration: Calibration, error: ImageError) -> str:
@@ -114,12 +151,18 @@ def _drawings(calibration: Calibration, views: Sequence[BoardView], error: Image
     return drawings(size, pixels, calibration.residuals, [view.name for view in used], error)
 
 
-def _left_out(calibration: Calibration, views: Sequence[BoardView], unusable: Sequence[tuple[str, str]]) -> str:
-    rows = [(views[index].name, 'fits far worse than the other views') for index in calibration.dropped]
-    rows += list(unusable)
-    return '<h2>Not used</h2>' + (
-        _table(('frame', 'reason'), rows, 'words') if rows else '<p>Every frame was used.</p>'
-    )
+def _left_out(frames: Sequence[LeftOut]) -> str:
+    if not frames:
+        return '<h2>Not used</h2><p>Every frame was used.</p>'
+    figures = [
+        f'<figure>{_drawn(frame.counts, frame.counts.shape[::-1], "")}'
+        f'<figcaption>{escape(f"{frame.name}: {frame.reason}")}</figcaption></figure>'
+        for frame in frames
+        if frame.counts is not None
+    ]
+    rows = [(frame.name, frame.reason) for frame in frames]
+    table = _table(('frame', 'reason'), rows, 'words')
+    return f'<h2>Not used</h2>{table}<div class="views">{"".join(figures)}</div>'
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], kind: str = 'numbers') -> str:
@@ -135,19 +178,20 @@ def _view_figures(calibration: Calibration, views: Sequence[BoardView]) -> str:
     every = np.concatenate(calibration.residuals)
     longest = float(np.percentile(np.linalg.norm(every, axis=1), 99.0))
     enlarged = _ARROW * calibration.camera.width / max(longest, 1e-6)
+    size = calibration.camera.width, calibration.camera.height
     figures = [
-        _view_figure(views[index], residual, enlarged, calibration)
+        _view_figure(views[index], residual, enlarged, size)
         for index, residual in zip(calibration.views.tolist(), calibration.residuals, strict=True)
     ]
     figures += [
-        _figure(views[index], '', f'{len(views[index].sighting.pixels)} points, not used', calibration)
+        _figure(views[index], '', f'{len(views[index].sighting.pixels)} points, not used', size)
         for index in calibration.dropped
     ]
     text = f'<p>Residuals, measured minus predicted, are drawn {enlarged:.0f} times as long as they are.</p>'
     return f'{text}<div class="views">{"".join(figures)}</div>'
 
 
-def _view_figure(view: BoardView, residual: FloatArray, enlarged: float, calibration: Calibration) -> str:
+def _view_figure(view: BoardView, residual: FloatArray, enlarged: float, size: tuple[int, int]) -> str:
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
     worst = float(np.linalg.norm(residual, axis=1).max())
     lines = ''.join(
@@ -155,26 +199,27 @@ def _view_figure(view: BoardView, residual: FloatArray, enlarged: float, calibra
         for (u, v), (du, dv) in zip(view.sighting.pixels.tolist(), (enlarged * residual).tolist(), strict=True)
     )
     caption = f'{len(residual)} points, rms {rms:.3f} px, largest {worst:.2f} px'
-    return _figure(view, lines, caption, calibration)
+    return _figure(view, lines, caption, size)
 
 
-def _figure(view: BoardView, lines: str, caption: str, calibration: Calibration) -> str:
+def _figure(view: BoardView, lines: str, caption: str, size: tuple[int, int]) -> str:
     """A view with its points, and ``lines`` from them."""
-    width, height = calibration.camera.width, calibration.camera.height
-    size = width / 200.0
-    points = ''.join(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{size:.1f}"/>' for u, v in view.sighting.pixels.tolist())
-    return (
-        f'<figure><svg viewBox="-0.5 -0.5 {width} {height}" role="img">{_thumbnail(view)}'
-        f'<g fill="none" stroke="#e6005c" stroke-width="{0.4 * size:.1f}">{points}{lines}</g></svg>'
-        f'<figcaption>{escape(view.name)}: {caption}</figcaption></figure>'
-    )
+    radius = size[0] / 200.0
+    points = ''.join(f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{radius:.1f}"/>' for u, v in view.sighting.pixels.tolist())
+    marks = f'<g fill="none" stroke="#e6005c" stroke-width="{0.4 * radius:.1f}">{points}{lines}</g>'
+    return f'<figure>{_drawn(view.counts, size, marks)}<figcaption>{escape(view.name)}: {caption}</figcaption></figure>'
 
 
-def _thumbnail(view: BoardView) -> str:
-    if view.counts is None:
-        return ''
-    low, high = np.percentile(view.counts, (0.5, 99.5))
-    shown = np.clip((view.counts - low) * (255.0 / max(high - low, 1.0)), 0, 255).astype(np.uint8)
+def _drawn(counts: Counts | Gray | None, size: tuple[int, ...], marks: str) -> str:
+    """A frame of ``size`` (width, height) with ``marks`` over it."""
+    width, height = size
+    thumbnail = '' if counts is None else _thumbnail(counts)
+    return f'<svg viewBox="-0.5 -0.5 {width} {height}" role="img">{thumbnail}{marks}</svg>'
+
+
+def _thumbnail(counts: Counts | Gray) -> str:
+    low, high = np.percentile(counts, (0.5, 99.5))
+    shown = np.clip((counts - low) * (255.0 / max(high - low, 1.0)), 0, 255).astype(np.uint8)
     height, width = shown.shape
     small = cv2.resize(shown, (min(width, _WIDTH), round(height * min(width, _WIDTH) / width)))
     code = base64.b64encode(cv2.imencode('.jpg', small, [cv2.IMWRITE_JPEG_QUALITY, 70])[1].tobytes()).decode()

@@ -1,6 +1,6 @@
 """Views of a calibration board in pictures or a bag: the usable ones, and the reasons against the others."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,11 +12,13 @@ from thermal_fiducial.calibration.intrinsics import Calibration, LEAST_VIEWS
 from thermal_fiducial.calibration.lens_choice import choose_model
 from thermal_fiducial.calibration.plots import coverage
 from thermal_fiducial.calibration.recognition import BoardNotFound
-from thermal_fiducial.calibration.report import BoardView
-from thermal_fiducial.calibration.sources import clean_frames, pictures, RawFrame
-from thermal_fiducial.calibration.targets import Sighting, Target
+from thermal_fiducial.calibration.report import BoardView, LeftOut
+from thermal_fiducial.calibration.sources import clean_frames, measured_points, pictures, RawFrame
+from thermal_fiducial.calibration.targets import settles_a_pose, Sighting, Target
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.types import Counts, Gray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import read_gray
@@ -35,28 +37,29 @@ class BoardViews:
     ----------
     target : the board; None where its points were measured elsewhere
     kept : usable views
-    unusable : name of each other frame, and why it is unusable
+    unusable : each other frame, and why it is unusable
     size : width and height of the image [px]
     """
 
     target: Target | None = None
     kept: list[BoardView] = field(default_factory=list)
-    unusable: list[tuple[str, str]] = field(default_factory=list)
+    unusable: list[LeftOut] = field(default_factory=list)
     size: tuple[int, int] = (0, 0)
+    _shown: Counter[str] = field(default_factory=Counter)
 
     def find(self, frame: RawFrame, camera: Camera) -> Sighting | None:
         """The board in a frame; None if it is not found, and the reason is kept in ``unusable``."""
         height, width = frame.counts.shape
         if self.kept and self.size != (width, height):
             reason = f'{width}x{height} pixels, the views before it have {self.size[0]}x{self.size[1]}'
-            self.unusable.append((frame.name, reason))
+            self.leave(frame.name, reason, frame.counts)
             return None
         self.size = (width, height)
         assert self.target is not None
         try:
             return self.target.find(frame.counts, camera)
         except BoardNotFound as reason:
-            self.unusable.append((frame.name, str(reason)))
+            self.leave(frame.name, str(reason), frame.counts)
             return None
 
     def keep(self, frame: RawFrame, sighting: Sighting) -> None:
@@ -64,6 +67,17 @@ class BoardViews:
         self.kept.append(BoardView(frame.name, sighting, frame.counts))
         cells = self.covered()
         print(f'{frame.name}: {len(sighting.pixels)} points; {np.sum(cells > 0)} of {cells.size} cells covered')
+
+    def leave(self, name: str, reason: str, counts: Counts | Gray | None = None) -> None:
+        """Leave out a frame for a reason; of frames with alike reasons the report shows some."""
+        kind = _kind(reason)
+        self._shown[kind] += counts is not None
+        self.unusable.append(LeftOut(name, reason, counts if self._shown[kind] <= _MOST_NAMES else None))
+
+    def print_unusable(self, begin: int = 0) -> None:
+        """Print the unusable frames from the number ``begin`` on, with their reasons."""
+        for frame in self.unusable[begin:]:
+            print(f'{frame.name}: not used: {frame.reason}')
 
     def covered(self) -> np.ndarray:
         """Number of points in each cell of the image."""
@@ -86,11 +100,11 @@ class BoardViews:
 
     def _reasons(self) -> list[str]:
         """The most frequent reasons with their frames; those that differ only in a figure are one, with the first's."""
-        frames: dict[str, list[tuple[str, str]]] = defaultdict(list)
-        for name, reason in self.unusable:
-            frames[re.sub(r'\d+(\.\d+)?', '', reason)].append((name, reason))
+        frames: dict[str, list[LeftOut]] = defaultdict(list)
+        for frame in self.unusable:
+            frames[_kind(frame.reason)].append(frame)
         often = sorted(frames.values(), key=len, reverse=True)[:_MOST_REASONS]
-        return [f'{_listed([name for name, _ in alike])}: {alike[0][1]}' for alike in often]
+        return [f'{_listed([frame.name for frame in alike])}: {alike[0].reason}' for alike in often]
 
     def look_again(self, camera: Camera) -> None:
         """Find the board again in all views, with the calibrated camera."""
@@ -110,10 +124,28 @@ class BoardViews:
         return choose_model(sightings, *self.size, models, radius=radius, focal_px=focal_px)
 
 
+def _kind(reason: str) -> str:
+    """A reason without its figures."""
+    return re.sub(r'\d+(\.\d+)?', '', reason)
+
+
 def _listed(names: Sequence[str]) -> str:
     if len(names) <= _MOST_NAMES:
         return ', '.join(names)
     return f'{names[0]} and {len(names) - 1} more'
+
+
+def look_at_points(source: Path, size: tuple[int, int]) -> BoardViews:
+    """Views of a CSV file of measured points, of images of ``size`` (width, height)."""
+    views = BoardViews(size=size)
+    for name, sighting in measured_points(source, *size):
+        if settles_a_pose(sighting):
+            views.kept.append(BoardView(name, sighting))
+        else:
+            points = number_of(len(sighting.pixels), 'point')
+            views.leave(name, f'{points}, where a view needs four, no three of them on a line')
+    views.print_unusable()
+    return views
 
 
 def look_at_pictures(source: Path, views: BoardViews, focal_px: float, most: int) -> None:
@@ -121,18 +153,21 @@ def look_at_pictures(source: Path, views: BoardViews, focal_px: float, most: int
     for index, path in enumerate(pictures(source)):
         if len(views.kept) == most:
             return
-        try:
-            counts = read_gray(path)
-        except InputError as reason:
-            views.unusable.append((path.name, str(reason).removeprefix(f'{path}: ')))
-            print(f'{path.name}: not used: {views.unusable[-1][1]}')
-            continue
-        frame = RawFrame(path.name, index * 10_000_000_000, counts)
-        sighting = views.find(frame, _guess(frame, focal_px))
-        if sighting is None:
-            print(f'{frame.name}: not used: {views.unusable[-1][1]}')
-        else:
-            views.keep(frame, sighting)
+        before = len(views.unusable)
+        _look_at_picture(path, index, views, focal_px)
+        views.print_unusable(before)
+
+
+def _look_at_picture(path: Path, index: int, views: BoardViews, focal_px: float) -> None:
+    try:
+        counts = read_gray(path)
+    except InputError as reason:
+        views.leave(path.name, str(reason).removeprefix(f'{path}: '))
+        return
+    frame = RawFrame(path.name, index * 10_000_000_000, counts)
+    sighting = views.find(frame, _guess(frame, focal_px))
+    if sighting is not None:
+        views.keep(frame, sighting)
 
 
 def look_at_bag(bag: BagReader, views: BoardViews, focal_px: float, most: int, every: int) -> None:
@@ -147,7 +182,7 @@ def look_at_bag(bag: BagReader, views: BoardViews, focal_px: float, most: int, e
             if _distance(pending[1], sighting) < _STILL_PX:
                 views.keep(*pending)
             else:
-                views.unusable.append((pending[0].name, 'the board moves'))
+                views.leave(pending[0].name, 'the board moves', pending[0].counts)
         pending = None
         if sighting is not None and _is_new(sighting, views.kept):
             pending = (frame, sighting)

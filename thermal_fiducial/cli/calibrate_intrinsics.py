@@ -1,6 +1,7 @@
 """``calibrate intrinsics``: camera_info from thermal views of a board, or from measured points."""
 
 import argparse
+from collections.abc import Sequence
 import math
 from pathlib import Path
 import sys
@@ -11,10 +12,10 @@ import yaml
 from thermal_fiducial.calibration.intrinsics import Calibration
 from thermal_fiducial.calibration.lens_check import image_error, ImageError
 from thermal_fiducial.calibration.lens_choice import CANDIDATES
-from thermal_fiducial.calibration.report import BoardView, write_report
-from thermal_fiducial.calibration.sources import is_folder_of_pictures, measured_points
+from thermal_fiducial.calibration.report import write_refusal, write_report
+from thermal_fiducial.calibration.sources import is_folder_of_pictures
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
-from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures
+from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures, look_at_points
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.ranges import BOARD_MM, BOARD_POINTS, FOCAL_PX, IMAGE_PX, MORE_POINTS
@@ -124,6 +125,27 @@ def _intrinsics(args: argparse.Namespace) -> int:
     if unknown:
         raise InputError(f'--models are {", ".join(CANDIDATES)}, not {", ".join(sorted(unknown))}')
     views = _views(args)
+    page = args.report or args.out.with_suffix('.html')
+    try:
+        result, fits = _solved(views, args, models)
+    except InputError as reason:
+        refused = page.with_stem(f'{page.stem}_refused')
+        write_refusal(refused, str(reason), views.size, views.kept, views.unusable)
+        raise InputError(f'{reason}; see {refused}') from None
+    error = image_error(result.camera, result.covariance, [views.kept[k].sighting for k in result.views.tolist()])
+    save_camera(args.out, result.camera)
+    _save_covariance(args.out, result, error)
+    write_report(page, result, views.kept, fits, error, views.unusable)
+    _print_result(args.out, result, fits, views, error)
+    _warn_of_focal_length(result)
+    _warn_of_principal_point(result)
+    return 0
+
+
+def _solved(
+    views: BoardViews, args: argparse.Namespace, models: Sequence[str]
+) -> tuple[Calibration, dict[str, Calibration]]:
+    """The best calibration, and the best of each lens model. Raises InputError, which names the source."""
     views.require(args.source)
     with naming(args.source):
         result, fits = views.solve(models, args.focal_px)
@@ -131,22 +153,14 @@ def _intrinsics(args: argparse.Namespace) -> int:
             # The first search refined the corners without knowledge of the distortion.
             views.look_again(result.camera)
             result, fits = views.solve(models, args.focal_px)
-    error = image_error(result.camera, result.covariance, [views.kept[k].sighting for k in result.views.tolist()])
-    save_camera(args.out, result.camera)
-    _save_covariance(args.out, result, error)
-    write_report(args.report or args.out.with_suffix('.html'), result, views.kept, fits, error, views.unusable)
-    _print_result(args.out, result, fits, views, error)
-    _warn_of_focal_length(result)
-    _warn_of_principal_point(result)
-    return 0
+        return result, fits
 
 
 def _views(args: argparse.Namespace) -> BoardViews:
     if _has_points(args):
         if args.size is None:
             raise InputError(f'{args.source}: points without pictures need --size WIDTH HEIGHT')
-        named = [BoardView(name, sighting) for name, sighting in measured_points(args.source, *args.size)]
-        return BoardViews(None, named, size=tuple(args.size))
+        return look_at_points(args.source, tuple(args.size))
     views = BoardViews(_target(args))
     if is_folder_of_pictures(args.source):
         look_at_pictures(args.source, views, args.focal_px, args.most_views)

@@ -227,6 +227,13 @@ def test_unreadable_pictures_and_those_of_another_size_are_named(tmp_path, capsy
     out, err = capsys.readouterr()
     assert 'b.png: not used: 320x200 pixels, the views before it have 320x256' in out
     assert 'd.png: not used: not a readable picture' in out
+    # The page of the refused run has the reason of each, and those that can be shown; no report is replaced by it.
+    page = (tmp_path / 'c_refused.html').read_text()
+    assert f'see {tmp_path / "c_refused.html"}' in err
+    assert not (tmp_path / 'c.html').exists()
+    for words in ('2 of 5 frames are usable', '<td>d.png</td><td>not a readable picture', 'b.png: 320x200 pixels'):
+        assert words in page
+    assert page.count('<figure>') == page.count('data:image/jpeg') == 3
     # The rest is looked at, and the line that ends it says what was wrong with which.
     assert 'e.png: 48 points' in out
     assert '2 of 5 frames are usable views' in err
@@ -238,8 +245,12 @@ def test_unreadable_pictures_and_those_of_another_size_are_named(tmp_path, capsy
 def test_reasons_that_differ_in_a_figure_are_one_in_the_error():
     """Fourteen views of a board with another diameter gave a line of fourteen reasons, in all ways to round 2.02."""
     views = BoardViews()
-    views.unusable = [(f'v{k}.png', f'the circles are {2.01 + 0.01 * (k % 3):.2f} times as wide') for k in range(14)]
-    views.unusable += [('dark.png', 'too faint'), ('broken.png', 'not a readable picture'), ('grey.png', 'too faint')]
+    for k in range(14):
+        views.leave(f'v{k}.png', f'the circles are {2.01 + 0.01 * (k % 3):.2f} times as wide', np.zeros((32, 32)))
+    for name, reason in (('dark', 'too faint'), ('broken', 'not a readable picture'), ('grey', 'too faint')):
+        views.leave(f'{name}.png', reason)
+    # Of those alike the report shows three.
+    assert [frame.counts is not None for frame in views.unusable] == 3 * [True] + 14 * [False]
     with pytest.raises(InputError) as refused:
         views.require(Path('views'))
     assert str(refused.value) == (
@@ -263,10 +274,19 @@ def test_a_principal_point_that_may_turn_the_camera_is_named(tmp_path, capsys, s
 
 def _calibrated(tmp_path, capsys, tilt_deg, shrunk=1):
     """Warnings of a calibration from twelve views of a board, tilted by up to an angle, by a camera of 640x512."""
+    width, height = 640 // shrunk, 512 // shrunk
+    points = tmp_path / 'points.csv'
+    points.write_text('\n'.join(_measured_views(tilt_deg, shrunk)))
+    words = ['calibrate', 'intrinsics', str(points), '--size', str(width), str(height), '--models', 'plumb_bob']
+    assert main([*words, '--out', str(tmp_path / 'lens.yaml')]) == 0
+    return capsys.readouterr().err
+
+
+def _measured_views(tilt_deg, shrunk=1):
+    """Lines of a CSV file of measured points."""
     rng = np.random.default_rng(1)
     K = np.array([[760.0, 0.0, 319.5], [0.0, 760.0, 255.5], [0.0, 0.0, 1.0]])
     K[:2] /= shrunk
-    width, height = 640 // shrunk, 512 // shrunk
     board = np.array([(0.05 * x, 0.05 * y, 0.0) for y in range(6) for x in range(8)])
     lines = ['view,point,u,v,x,y']
     for view in range(12):
@@ -274,10 +294,20 @@ def _calibrated(tmp_path, capsys, tilt_deg, shrunk=1):
         place = np.array([rng.uniform(-0.3, -0.05), rng.uniform(-0.25, 0.0), rng.uniform(0.75, 1.1)])
         pixels = cv2.projectPoints(board, turn, place, K, None)[0][:, 0] + rng.normal(0.0, 0.05, (len(board), 2))
         for point, ((u, v), (x, y, _)) in enumerate(zip(pixels, board, strict=True)):
-            if 0.0 < u < width - 1 and 0.0 < v < height - 1:
+            if 0.0 < u < 640 // shrunk - 1 and 0.0 < v < 512 // shrunk - 1:
                 lines.append(f'{view},{point},{u:.4f},{v:.4f},{x:.4f},{y:.4f}')
-    points = tmp_path / 'points.csv'
-    points.write_text('\n'.join(lines))
-    words = ['calibrate', 'intrinsics', str(points), '--size', str(width), str(height), '--models', 'plumb_bob']
+    return lines
+
+
+@pytest.mark.parametrize('points', [(40,), (0, 1, 2), (0, 1, 2, 3, 4, 5, 6), (0, 1, 2, 8)])
+def test_views_of_too_few_measured_points_are_named(tmp_path, capsys, points):
+    """One of three was refused as "The number of points in the view #5 is < 4", one of a line without its name."""
+    head, *lines = _measured_views(35.0)
+    named = {(view, int(point)): line for line in lines for view, point in [line.split(',')[:2]]}
+    kept = [line for (view, point), line in named.items() if view != '7' or point in points]
+    source = tmp_path / 'points.csv'
+    source.write_text('\n'.join([head, *kept]))
+    words = ['calibrate', 'intrinsics', str(source), '--size', '640', '512', '--models', 'plumb_bob']
     assert main([*words, '--out', str(tmp_path / 'lens.yaml')]) == 0
-    return capsys.readouterr().err
+    number = '1 point' if len(points) == 1 else f'{len(points)} points'
+    assert f'\n7: not used: {number}, where a view needs four' in '\n' + capsys.readouterr().out
