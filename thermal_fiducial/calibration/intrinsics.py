@@ -146,10 +146,15 @@ def _start(sightings: Sequence[Sighting], width: int, height: int, model: str, f
     flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     points = [sighting.points.astype(np.float32) for sighting in sightings]
     pixels = [sighting.pixels.astype(np.float32) for sighting in sightings]
+    threads = cv2.getNumThreads()
+    # Threads add up the views in the order in which they finish: two runs differed in the last digits of their files.
+    cv2.setNumThreads(1)
     try:
         _, K, _, _, _ = cv2.calibrateCamera(points, pixels, (width, height), K, np.zeros(5), flags=flags)
     except cv2.error as error:
         raise InputError(f'views from which no camera follows: {error.err}') from None
+    finally:
+        cv2.setNumThreads(threads)
     if not 0.1 * width < K[0, 0] < 20.0 * width:
         K[0, 0] = K[1, 1] = focal_px
     return Camera(width, height, np.asarray(K, dtype=np.float64), model)

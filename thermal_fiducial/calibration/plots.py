@@ -77,7 +77,7 @@ def _figure(title: str, size: tuple[float, float] = _SIZE) -> tuple[Figure, Any]
 
 def _html(figure: Figure, title: str, *, wide: bool = False) -> str:
     stream = io.StringIO()
-    figure.savefig(stream, format='svg')
+    figure.savefig(stream, format='svg', metadata={'Date': None})
     text = stream.getvalue()
     drawing = text[text.index('<svg') :].replace(_INK, 'currentColor')
     return f'<figure class="{"wide" if wide else "plot"}" aria-label="{escape(title)}">{drawing}</figure>'
