@@ -3,7 +3,6 @@
 BAG holds ``imu/data``. POSES.tum holds poses of the IMU in the map from anything that finds them: motion capture, SLAM.
 """
 
-from heapq import merge
 from pathlib import Path
 import sys
 
@@ -23,10 +22,10 @@ def main(bag: str, poses: str, out: str) -> None:
     ekf = PoseEkf(config.pose_ekf)
     stamps, positions, quaternions = load_tum(poses)
     T_map_camera = transform_from_quaternion(positions, quaternions)
-    measured = [CameraPose(int(stamp), T, COVARIANCE) for stamp, T in zip(stamps, T_map_camera, strict=True)]
-    samples = [item for item in read_bag(bag) if isinstance(item, ImuSample)]
+    records: list[ImuSample | CameraPose] = [item for item in read_bag(bag) if isinstance(item, ImuSample)]
+    records += [CameraPose(int(stamp), T, COVARIANCE) for stamp, T in zip(stamps, T_map_camera, strict=True)]
     with Path(out).open('w') as file:
-        for item in merge(samples, measured, key=lambda record: record.stamp_ns):
+        for item in sorted(records, key=lambda record: record.stamp_ns):
             if isinstance(item, CameraPose):
                 ekf.add_pose(item)
             elif (odometry := ekf.add_imu(item)) is not None:

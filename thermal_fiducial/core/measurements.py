@@ -5,6 +5,7 @@ about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that t
 ``p = p_hat + d[:3]`` and ``R = exp(d[3:]) @ R_hat``.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ import numpy as np
 from thermal_fiducial.core.geometry.reprojection import turned
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked
+from thermal_fiducial.errors import InputError
 
 if TYPE_CHECKING:
     # Not imported here: the filter uses this module, and restarts sooner without OpenCV.
@@ -154,7 +156,15 @@ class Observations(Stacked):
 
     @staticmethod
     def of(markers: Markers) -> 'Observations':
-        """Observations of rows with valid corners; rows whose ID occurs twice are left out as ambiguous."""
+        """Observations of rows with valid corners; rows whose ID occurs twice are left out as ambiguous.
+
+        Raises
+        ------
+        InputError
+            ``markers`` are no rows of :data:`MARKER_DTYPE`.
+        """
+        if getattr(markers, 'dtype', None) != MARKER_DTYPE:
+            raise InputError('markers that are no rows of MARKER_DTYPE, as MarkerDetector.detect returns them')
         numbers = _numbers(markers, _CORNERS + _COVARIANCES + _OF_DETECTOR + _BRANCHES)
         corners = numbers[:, : len(_CORNERS)].reshape(-1, 4, 2)
         covariances = numbers[:, len(_CORNERS) : -len(_BRANCHES) - 1].reshape(-1, 4, 2, 2)
@@ -172,9 +182,29 @@ class Observations(Stacked):
         return observations if usable.all() else observations.only(usable)
 
 
+_IMU_SHAPES = {'angular_velocity': (3,), 'linear_acceleration': (3,)}
+_POSE_SHAPES = {'T_map_camera': (4, 4), 'covariance': (6, 6), 'map_covariance': (6, 6)}
+
+
+def _check(record: 'ImuSample | CameraPose', shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise InputError if arrays of a ``record`` have other ``shapes``, or its stamp is not in whole nanoseconds."""
+    if not isinstance(record.stamp_ns, (int, np.integer)):
+        raise InputError(f'{type(record).__name__}: stamp_ns {record.stamp_ns!r} is not an integer of nanoseconds')
+    for name, shape in shapes.items():
+        if getattr(getattr(record, name), 'shape', None) != shape:
+            found = f'is a {type(value := getattr(record, name)).__name__} of shape {np.shape(value)}'
+            raise InputError(f'{type(record).__name__}: {name} {found}, not a numpy array of shape {shape}')
+
+
 @dataclass(frozen=True, slots=True)
 class ImuSample:
-    """One IMU message, in ``base_link`` (x forward, y left, z up)."""
+    """One IMU message, in ``base_link`` (x forward, y left, z up).
+
+    Raises
+    ------
+    InputError
+        A stamp that is not an integer, or an array of another shape.
+    """
 
     stamp_ns: int
     #: (3,) [rad/s]
@@ -182,10 +212,19 @@ class ImuSample:
     #: (3,) specific force [m/s^2]: +9.81 on z at rest
     linear_acceleration: FloatArray
 
+    def __post_init__(self) -> None:
+        _check(self, _IMU_SHAPES)
+
 
 @dataclass(frozen=True, slots=True)
 class CameraPose:
-    """The camera in the map from the markers of one frame."""
+    """The camera in the map from the markers of one frame.
+
+    Raises
+    ------
+    InputError
+        A stamp that is not an integer, or an array of another shape.
+    """
 
     stamp_ns: int
     #: (4, 4)
@@ -198,6 +237,9 @@ class CameraPose:
     marker_ids: tuple[int, ...] = field(default=())
     #: re-projection error, rms over their corners [px]
     rms_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        _check(self, _POSE_SHAPES)
 
 
 def in_moved_map(pose: CameraPose, T_new_old: FloatArray) -> CameraPose:

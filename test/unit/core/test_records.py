@@ -3,10 +3,12 @@
 from dataclasses import fields, is_dataclass
 
 import numpy as np
+import pytest
 from support import small_bag
 
-from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.core.measurements import CameraPose, ImuSample, MARKER_DTYPE, Observations
 from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
 
 
@@ -69,3 +71,25 @@ def test_no_stage_changes_what_it_received_or_has_handed_on():
     assert len(sealed.copies) > 1000
     for array, copy in sealed.copies:
         np.testing.assert_array_equal(array, copy)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'values', 'words'),
+    [
+        (ImuSample, (0, [0.0] * 3, np.zeros(3)), r'angular_velocity is a list of shape \(3,\), not a numpy array'),
+        (ImuSample, (0, np.zeros(3), np.zeros((3, 1))), r'linear_acceleration is a ndarray of shape \(3, 1\)'),
+        (ImuSample, (0.005, np.zeros(3), np.zeros(3)), 'ImuSample: stamp_ns 0.005 is not an integer of nanoseconds'),
+        (CameraPose, (0, np.zeros(7), np.eye(6)), r'T_map_camera is a ndarray of shape \(7,\)'),
+        (CameraPose, (0, np.eye(4), np.ones(36)), r'CameraPose: covariance is a ndarray of shape \(36,\), not'),
+        (CameraPose, (0, np.eye(4), np.eye(6), np.eye(3)), 'map_covariance'),
+    ],
+)
+def test_a_record_of_other_shapes_or_units_of_time_is_refused(kind, values, words):
+    with pytest.raises(InputError, match=words):
+        kind(*values)
+
+
+@pytest.mark.parametrize('markers', [[], np.zeros((4, 2)), np.zeros(2, MARKER_DTYPE).tolist()])
+def test_what_is_no_row_of_markers_is_refused(markers):
+    with pytest.raises(InputError, match='no rows of MARKER_DTYPE'):
+        Observations.of(markers)

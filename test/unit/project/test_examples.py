@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support import small_bag
 
-from thermal_fiducial import load_map
+from thermal_fiducial import InputError, load_map
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.trajectory_file import load_tum, save_tum
@@ -75,7 +75,7 @@ def test_detect_in_picture(tmp_path, capsys):
 
 def test_a_picture_that_is_not_there_is_named(tmp_path):
     save_camera(tmp_path / 'camera.yaml', small_bag.CAMERA)
-    with pytest.raises(SystemExit, match=r'frame\.png: no picture'):
+    with pytest.raises(InputError, match=r'frame\.png: cannot read it'):
         run('detect_in_picture', tmp_path / 'frame.png', tmp_path / 'camera.yaml')
 
 

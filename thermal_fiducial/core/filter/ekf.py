@@ -15,7 +15,7 @@ from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
 from thermal_fiducial.core.filter.output import condition_of, figures_of, in_corrected_map, odometry
 from thermal_fiducial.core.filter.propagation import usable_seconds
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
-from thermal_fiducial.core.geometry.plausibility import checked_covariance
+from thermal_fiducial.core.geometry.plausibility import checked_covariance, is_rigid
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, Condition, ImuSample, in_moved_map, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
@@ -123,8 +123,8 @@ class PoseEkf:
         """Why a pose cannot be used; empty if it can. It may take the place of poses with other stamps."""
         if self._history.main is None and self._camera_clock.in_question:
             return CLOCK_JUMPED
-        if not np.isfinite(pose.T_map_camera).all():
-            return 'refused: not finite'
+        if not is_rigid(pose.T_map_camera):
+            return 'refused: no finite rotation and translation'
         try:
             checked_covariance(pose.covariance, 'covariance')
         except InputError as error:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 import numpy.typing as npt
 
+from thermal_fiducial.core.geometry.plausibility import require_image
 from thermal_fiducial.core.types import BoolArray, Counts, FloatArray, Gray, Stacked, TINY
 from thermal_fiducial.errors import InputError
 
@@ -58,7 +59,8 @@ class Camera:
     Raises
     ------
     InputError
-        Unknown model, wrong number of coefficients, or a K that can't be one (not finite, no focal length).
+        Unknown model, wrong number of coefficients, or a K that can't be one (of another form, not finite, no focal
+        length).
     """
 
     width: int
@@ -68,15 +70,20 @@ class Camera:
     D: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        K = np.array(self.K, dtype=np.float64).reshape(3, 3)
+        K = np.array(self.K, dtype=np.float64)
         D = np.zeros(0) if self.D is None else np.array(self.D, dtype=np.float64).reshape(-1)
         if self.model not in MODELS:
             raise InputError(f'distortion model {self.model!r} is not one of {", ".join(MODELS)}')
         count = len(MODELS[self.model])
         if D[count:].any():
             raise InputError(f'{self.model} takes {count} coefficients, not {len(D)}')
+        if K.size != 9:
+            raise InputError(f'camera matrix of shape {K.shape}, not (3, 3)')
+        K = K.reshape(3, 3)
         if not (np.all(np.isfinite(K)) and np.all(np.isfinite(D)) and K[0, 0] > 0 and K[1, 1] > 0):
             raise InputError('camera matrix without a focal length: the camera is not calibrated')
+        if K[1, 0] != 0.0 or not np.array_equal(K[2], (0.0, 0.0, 1.0)) or not abs(K[0, 1]) < K[0, 0]:
+            raise InputError('camera matrix that is not of the form fx s cx, 0 fy cy, 0 0 1')
         if self.width <= 0 or self.height <= 0:
             raise InputError(f'image size {self.width}x{self.height} in the calibration')
         filled = np.zeros(count)
@@ -102,7 +109,8 @@ class Camera:
         return self.K[:2, 2]
 
     def require_size_of(self, image: Counts | Gray) -> None:
-        """Raise InputError if an ``image`` (H, W) has another size than the calibration."""
+        """Raise InputError if ``image`` (H, W) is none of 8 or 16 bits, or of another size than the calibration."""
+        require_image(image)
         height, width = image.shape
         if (height, width) != (self.height, self.width):
             raise InputError(f'image of {width}x{height}, camera_info of {self.width}x{self.height} pixels')

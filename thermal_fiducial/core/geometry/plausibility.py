@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import Counts, FloatArray, Gray
 from thermal_fiducial.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ _NO_VARIANCE = 1e-15
 #: Focal length and distance of the principal point from the image, in longer sides of the image.
 _FOCAL_RANGE, _FARTHEST_CENTRE = (0.02, 1000.0), 1.0
 _IMAGE_SIDES = (8, 16384)
+#: How far a rotation matrix times its transpose may be off the identity: one that was written down with four digits.
+_ORTHONORMAL = 1e-3
 #: Error [px] to which a distortion must be invertible half-way from the centre to the corners.
 _ROUND_TRIP_PX = 1.0
 
@@ -62,6 +64,20 @@ def checked_covariance(values: FloatArray, what: str, *, partial: bool = False) 
     return values if (np.abs(symmetric - values) <= _ROUNDING * np.abs(values)).all() else symmetric
 
 
+def is_rigid(T: FloatArray) -> bool:
+    """Whether ``T`` (4, 4) is finite, and a rotation with a translation: neither scaled nor mirrored."""
+    R = T[:3, :3]
+    return bool(np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < _ORTHONORMAL and np.linalg.det(R) > 0.0)
+
+
+def require_image(image: Counts | Gray) -> None:
+    """Raise InputError if ``image`` is no array (height, width) of 8 or 16 bits in the byte order of this computer."""
+    if not isinstance(image, np.ndarray):
+        raise InputError(f'{type(image).__name__} is no image: an array (height, width) of uint16 or uint8 is one')
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f'frame of {image.dtype} with shape {image.shape} is not an 8 or 16 bit image')
+
+
 def require_usable(camera: 'Camera') -> 'Camera':
     """``camera``, if it is plausible.
 
@@ -73,8 +89,6 @@ def require_usable(camera: 'Camera') -> 'Camera':
     K, longer = camera.K, max(camera.width, camera.height)
     if not all(_IMAGE_SIDES[0] <= side <= _IMAGE_SIDES[1] for side in (camera.width, camera.height)):
         raise InputError(f'calibration of an image of {camera.width}x{camera.height} pixels')
-    if K[1, 0] != 0.0 or not np.array_equal(K[2], (0.0, 0.0, 1.0)) or not abs(K[0, 1]) < K[0, 0]:
-        raise InputError('camera matrix that is not of the form fx s cx, 0 fy cy, 0 0 1')
     for name, focal in (('fx', K[0, 0]), ('fy', K[1, 1])):
         if not _FOCAL_RANGE[0] * longer < focal < _FOCAL_RANGE[1] * longer:
             raise InputError(f'camera matrix with {name} {focal:.6g} for an image of {camera.width}x{camera.height}')

@@ -14,6 +14,7 @@ import numpy as np
 
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.frame_period import FramePeriod
+from thermal_fiducial.core.geometry.plausibility import require_image
 from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder
 from thermal_fiducial.core.measurements import LATEST_NS
 from thermal_fiducial.core.pixel_noise import pixel_noise
@@ -123,8 +124,7 @@ class FrameCleaner:
 
     def _image(self, counts: Counts | Gray) -> Counts:
         """A copy of the image rows as counts, without telemetry and flag bits."""
-        if counts.ndim != 2 or counts.dtype not in (np.uint8, np.uint16):
-            raise InputError(f'frame of {counts.dtype} with shape {counts.shape} is not an 8 or 16 bit image')
+        require_image(counts)
         height = counts.shape[0]
         extra = next((height - h for h in STANDARD_HEIGHTS if 0 < height - h <= MAX_TELEMETRY_ROWS), 0)
         image = self._without_telemetry(counts, extra) if extra else counts

@@ -274,6 +274,8 @@ def test_unusable_poses_are_refused_with_a_reason(short_flight, flown):
     assert 'repeated' in ekf.add_pose(flight.poses[-1]).reason
     assert 'ahead' in ekf.add_pose(replace(pose, stamp_ns=pose.stamp_ns + 60_000_000_000)).reason
     assert 'finite' in ekf.add_pose(replace(flight.poses[-1], T_map_camera=np.full((4, 4), np.nan))).reason
+    for no_rotation in (np.diag([2.0, 2.0, 2.0, 1.0]), np.diag([1.0, 1.0, -1.0, 1.0])):
+        assert 'no finite rotation' in ekf.add_pose(replace(flight.poses[-1], T_map_camera=no_rotation)).reason
     shifted = flight.poses[-1].T_map_camera.copy()
     shifted[0, 3] += 1.0
     update = ekf.add_pose(replace(flight.poses[-1], stamp_ns=pose.stamp_ns + 2_650_000_000, T_map_camera=shifted))

@@ -211,6 +211,8 @@ def test_short_coefficients_are_filled_up():
     [
         ((640, 512, K, 'tangent'), "'tangent' is not one of"),
         ((640, 512, K, 'equidistant', [0.1] * 5), 'takes 4 coefficients, not 5'),
+        ((640, 512, [745.0, 745.0, 319.5, 255.5]), r'shape \(4,\), not \(3, 3\)'),
+        ((640, 512, K.T), 'not of the form'),
         ((640, 512, np.zeros((3, 3))), 'not calibrated'),
         ((640, 512, np.full((3, 3), np.nan)), 'not calibrated'),
         ((640, 512, K, 'plumb_bob', [np.inf, 0, 0, 0, 0]), 'not calibrated'),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.plausibility import checked_covariance, require_usable
+from thermal_fiducial.core.geometry.plausibility import checked_covariance, require_image, require_usable
 from thermal_fiducial.errors import InputError
 
 K = np.array([[530.0, 0.0, 319.5], [0.0, 530.0, 255.5], [0.0, 0.0, 1.0]])
@@ -85,11 +85,26 @@ def test_a_camera_of_a_real_lens_is_returned():
     ],
 )
 def test_a_camera_that_no_lens_makes_is_refused(size, place, value, words):
-    camera = Camera(*size, with_entry(K, place, value))
     with pytest.raises(InputError, match=words):
-        require_usable(camera)
+        require_usable(Camera(*size, with_entry(K, place, value)))
 
 
 def test_a_distortion_that_folds_the_image_is_refused():
     with pytest.raises(InputError, match='that no lens has'):
         require_usable(Camera(640, 512, K, D=[-5.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ('image', 'words'),
+    [
+        ([[0, 1]], 'list is no image'),
+        (None, 'NoneType is no image'),
+        (np.zeros((4, 5)), r'frame of float64 with shape \(4, 5\)'),
+        (np.zeros((4, 5, 3), np.uint16), r'shape \(4, 5, 3\)'),
+        # As some libraries read TIFF and PNG: no marker was found in it, without a word.
+        (np.zeros((4, 5), '>u2'), 'frame of >u2'),
+    ],
+)
+def test_what_is_no_image_is_refused(image, words):
+    with pytest.raises(InputError, match=words):
+        require_image(image)
