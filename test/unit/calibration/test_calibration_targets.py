@@ -118,7 +118,10 @@ def test_command_calibrates_a_folder(tmp_path, capsys):
     assert '08.png: not used: no board found: out of view' in printed
     page = out.with_suffix('.html').read_text()
     # Every view with its points and residuals under its name, and the one that gave nothing with the reason.
-    drawn, seen = page[: page.index('class="views"')], page[page.index('class="views"') :]
+    drawn, rest = page.split('<h2>Not used</h2>')
+    unused, seen = rest.split('<h2>Views</h2>')
+    assert unused.count('<figure>') == 1
+    assert '08.png: no board found' in unused
     assert seen.count('<figure>') == 8
     assert seen.count('<circle') == seen.count('<path') >= 8 * 24
     # Drawings stand side by side, none in another, in the colour of the page's text: dark pages are read too.
