@@ -46,6 +46,8 @@ class Input:
         self.subscription: Any = None
         #: whether it comes at a rate, and is missed when it stops; else when there is something new
         self.regular = True
+        #: message that waits for :meth:`CountingNode.behind_others`
+        self.pending: Any = None
 
     def newest(self, message: Any, at_most: int) -> Any:
         """The newest of a message that has been counted and those queued behind it, of which ``at_most`` are taken.
@@ -136,14 +138,24 @@ class CountingNode(Node):
     ) -> Input:
         """Call ``callback`` with the newest message; older ones are skipped and counted, also those beyond the queue.
 
-        Lazy subscriptions (:meth:`subscribe_lazily`) are taken first.
+        Lazy subscriptions (:meth:`subscribe_lazily`) are taken first. EventsExecutor queues an event for each message
+        behind all others: where messages come faster than they are processed, timers and services would wait ever
+        longer. So a message is only taken in its turn, and processed behind what has been queued until then.
         """
         source = Input(self.resolve_topic_name(topic))
 
-        def receive(message: Any) -> None:
+        def process() -> None:
+            message, source.pending = source.pending, None
             self.take_waiting()
+            self.guard(callback, message)
+
+        def receive(message: Any) -> None:
             source.count += 1
-            self.guard(callback, source.newest(message, profile.depth))
+            queued = source.pending is not None
+            source.left += queued
+            source.pending = source.newest(message, profile.depth)
+            if not queued:
+                self.behind_others(process)
 
         source.subscription = self.create_subscription(kind, topic, receive, profile, raw=raw)
         self.inputs.append(source)
@@ -171,6 +183,10 @@ class CountingNode(Node):
         for subscription, source in self.lazy.items():
             for message in source.waiting(subscription.qos_profile.depth):
                 self.guard(subscription.callback, message)
+
+    def behind_others(self, act: Callable[[], None]) -> None:
+        """Call ``act``; subclasses that share an executor with timers and services let these go first."""
+        act()
 
     def guard(self, callback: Callable[[Any], None], message: Any) -> None:
         """Call ``callback``; subclasses handle its errors."""

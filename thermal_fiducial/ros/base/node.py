@@ -150,6 +150,13 @@ class StageNode(CountingNode, Generic[Config]):
             if self.context.ok():
                 self.refuse(self._unforeseen(error))
 
+    def behind_others(self, act: Callable[[], None]) -> None:
+        """Call ``act`` after all that the executor has queued; at once in a lock-step replay, which counts messages."""
+        if self.live and self.executor is not None:
+            self.executor.create_task(act)
+        else:
+            act()
+
     def serve(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
         """Offer a service; errors of ``answer`` are reported in the response's ``success`` and ``message``."""
 
