@@ -1,6 +1,5 @@
 """Node ``landing_target``: pose of the landing pad, for an autopilot behind mavros."""
 
-from collections import deque
 import sys
 from typing import Any
 
@@ -14,13 +13,11 @@ from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import OK, StageNode, WARN
-from thermal_fiducial.ros.frames.landing_pad import for_mavros, needs_no_map, pad_in_map, what_lacks
+from thermal_fiducial.ros.frames.landing_pad import for_mavros, needs_no_map, pad_in_map, WaitingFrames, what_lacks
 from thermal_fiducial.ros.frames.map_corrections import MapCorrections
 from thermal_fiducial.ros.frames.robot_frames import RobotFrames
 from thermal_fiducial.ros.messages import clouds, convert, message_bytes
 from thermal_fiducial.ros.process.run import run
-
-_WAITING = 10  # most frames waiting for their camera pose: a third of a second
 
 
 class LandingTarget(StageNode[LandingTargetConfig]):
@@ -32,7 +29,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
             self.fault('parameter landing_pad: name the markers of the pad')
         self._T_map_pad: FloatArray | None = None
         self._lacking = 'the pad is not in the map'
-        self._frames: deque[int] = deque(maxlen=_WAITING)  # stamps of those that show the pad, without a pose so far
+        self._frames = WaitingFrames()
         self._in_view = False
         self._corrections = MapCorrections()
         self._target = self.advertise(PoseStamped, 'landing_target')
@@ -54,23 +51,17 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         self._in_view = len(seen.ids) > 0
         if not self._in_view:
             return
-        T_camera_pad, alone = seen.branches[0, 0], self._T_map_pad is None or self._stalled
-        if alone and needs_no_map(self.config) and np.isfinite(T_camera_pad).all():
+        T_camera_pad, without_pose = seen.branches[0, 0], self._T_map_pad is None or self._frames.stalled
+        alone = without_pose and needs_no_map(self.config) and bool(np.isfinite(T_camera_pad).all())
+        if alone:
             self._send_in_body(stamp, T_camera_pad)
         if self._T_map_pad is not None:
-            self._frames.append(stamp)
-
-    @property
-    def _stalled(self) -> bool:
-        """Whether frames that show the pad get no camera pose."""
-        return len(self._frames) == _WAITING
+            self._frames.add(stamp, sent=alone)
 
     def _on_camera_pose(self, message: bytes) -> None:
         pose = self._corrections.in_present_map(message_bytes.camera_pose(message))
-        if self._T_map_pad is None or pose.stamp_ns not in self._frames:
+        if self._T_map_pad is None or not self._frames.take(pose.stamp_ns):
             return
-        while self._frames.popleft() != pose.stamp_ns:  # Those before it have no pose.
-            pass
         if self.config.landing_target_frame == 'body':
             self._send_in_body(pose.stamp_ns, inverse(pose.T_map_camera) @ self._T_map_pad)
         else:
@@ -88,7 +79,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
             return WARN, self._lacking
         if not self._in_view:
             return OK, 'the pad is not in view'
-        return (WARN, 'the pad is in view, but its frames have no camera_pose') if self._stalled else (OK, 'ok')
+        return (WARN, 'the pad is in view, but its frames have no camera_pose') if self._frames.stalled else (OK, 'ok')
 
 
 def main() -> int:

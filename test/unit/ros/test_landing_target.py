@@ -165,9 +165,14 @@ def test_frames_without_a_camera_pose_are_reported_and_a_pad_of_one_marker_goes_
     sent = [convert.stamp_ns(message.header.stamp) - STAMP for message in graph.heard['landing_target']]
     # Ten frames wait for theirs.
     assert sent == ([10, 11, 12, 13, 14] if len(pad) == 1 else [])
-    graph.send('camera_pose', camera_pose(STAMP + 12))
+    graph.send('camera_pose', camera_pose(STAMP + 9), camera_pose(STAMP + 12))
     graph.send('markers', markers(7, stamp=STAMP + 15))
+    graph.send('camera_pose', camera_pose(STAMP + 15))
     assert graph.diagnose(node)[:2] == (OK, 'ok')
+    # None of one stamp twice, and none older than one before it.
+    count = 6 if len(pad) == 1 else 3
+    again = [convert.stamp_ns(message.header.stamp) - STAMP for message in heard(graph, count)]
+    assert again == ([*sent, 15] if len(pad) == 1 else [9, 12, 15])
 
 
 @pytest.mark.parametrize('quaternion', [(0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0)])

@@ -1,5 +1,6 @@
 """Pose of a landing pad: one marker of the map, or a group of them."""
 
+from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
@@ -11,6 +12,38 @@ from thermal_fiducial.core.types import FloatArray
 #: mavros applies the ENU to NED conversion (x, y, z) -> (y, x, -z) in every frame. Given right-forward-up axes it
 #: yields forward-right-down, so forward-left-up is turned by 90 degrees first.
 _T_RFU_FLU = transform([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.zeros(3))
+
+_WAITING = 10  # most frames waiting for their camera pose: a third of a second
+
+
+class WaitingFrames:
+    """Frames that show the pad and have no camera pose so far."""
+
+    def __init__(self) -> None:
+        # Stamp of each, and whether its pad was sent without a pose.
+        self._frames: deque[tuple[int, bool]] = deque(maxlen=_WAITING)
+
+    @property
+    def stalled(self) -> bool:
+        """Whether they get no camera poses."""
+        return len(self._frames) == _WAITING
+
+    def add(self, stamp_ns: int, *, sent: bool) -> None:
+        """A frame that shows the pad; ``sent``: without waiting for its pose."""
+        self._frames.append((stamp_ns, sent))
+
+    def take(self, stamp_ns: int) -> bool:
+        """End the wait of a frame that has a pose, and of those before it; whether its pad is to be sent.
+
+        Not when it was sent, or that of a newer frame, before poses came again.
+        """
+        stamps = [stamp for stamp, _ in self._frames]
+        if stamp_ns not in stamps:
+            return False
+        overtaken = False
+        for _ in range(stamps.index(stamp_ns) + 1):
+            _, overtaken = self._frames.popleft()
+        return not (overtaken or any(sent for _, sent in self._frames))
 
 
 def pad_in_map(T_map_markers: Mapping[int, FloatArray], pad_ids: Sequence[int]) -> FloatArray | None:
