@@ -130,3 +130,27 @@ def test_all_markers_are_drawn_once_and_then_those_that_change_colour(graph, tmp
     graph.diagnose(node)
     graph.spin_until(lambda: len(heard) == 4)
     assert len(heard[3].markers) == 7
+
+
+def test_a_subscriber_in_place_of_another_is_drawn_all_markers(graph, tmp_path, monkeypatch):
+    """RViz that was started again within a second kept the few markers that had changed colour last."""
+    path = tmp_path / 'map.yaml'
+    save_map(path, MarkerMap({i: MapMarker(i, 0.3, True, transform(np.eye(3), [i, 0.0, 0.0])) for i in range(3)}))
+    node = graph.add(MarkerMapperNode, map_file=str(path))
+    topic, drawing = 'marker_map/markers', graph.output(node, 'marker_map/markers')
+    first = graph.tester.create_subscription(MarkerArray, topic, lambda _: None, qos.LATCHED)
+    graph.spin_until(lambda: drawing.listeners == 1)
+    graph.diagnose(node)
+    monkeypatch.setattr(node.mapper, 'learn', lambda _: MapperResult(1, None, '', in_view=frozenset({1})))
+    graph.send('thermal/camera_info', info())
+    graph.send('markers', clouds.cloud(np.zeros(0, MARKER_DTYPE), convert.header(1, 'camera')))
+    graph.diagnose(node)
+    graph.tester.destroy_subscription(first)
+    graph.spin_until(lambda: drawing.listeners == 0)
+    graph.listen(MarkerArray, topic, qos.LATCHED)
+    heard = graph.heard[topic]
+    graph.spin_until(lambda: drawing.listeners == 1 and heard)
+    assert {m.id for m in heard[0].markers} == {1}
+    graph.diagnose(node)
+    graph.spin_until(lambda: len(heard) == 2)
+    assert [m.id for m in heard[1].markers if m.ns == 'plates'] == [0, 1, 2]

@@ -24,10 +24,10 @@ _XYZ = np.dtype([(axis, '<f4') for axis in 'xyz'])
 
 @dataclass(frozen=True)
 class _MapDrawing:
-    """State of the display: markers drawn as in view, number of subscribers."""
+    """State of the display: markers drawn as in view, subscribers that have it by their identifiers in DDS."""
 
     in_view: frozenset[int]
-    listeners: int
+    listeners: frozenset[tuple[int, ...]]
 
 
 class MapTopics:
@@ -35,6 +35,7 @@ class MapTopics:
 
     def __init__(self, node: StageNode[MarkerMapperConfig]) -> None:
         config = node.config
+        self._node = node
         self._frame_id = config.map_frame
         self._drawn: _MapDrawing | None = None
         self._rows = node.advertise(PointCloud2, 'marker_map', qos.LATCHED)
@@ -56,8 +57,8 @@ class MapTopics:
 
     def draw(self, marker_map: MarkerMap, in_view: frozenset[int], stamp_ns: int) -> None:
         """Publish the markers for RViz: all after a change or for a new subscriber, else those that change colour."""
-        now = _MapDrawing(in_view, self._drawing.listeners)
-        whole = self._drawn is None or now.listeners > self._drawn.listeners
+        now = _MapDrawing(in_view, self._listeners())
+        whole = self._drawn is None or not now.listeners <= self._drawn.listeners
         recoloured = in_view if self._drawn is None else in_view ^ self._drawn.in_view
         if whole or recoloured:
             rows = marker_map.rows(in_view)
@@ -65,6 +66,11 @@ class MapTopics:
             head = convert.header(stamp_ns, self._frame_id)
             self._drawing.send(display.map_markers(shown, head, whole=whole))
         self._drawn = now
+
+    def _listeners(self) -> frozenset[tuple[int, ...]]:
+        """Subscribers of the drawing: as many as before may be others, as when RViz is started again."""
+        every = self._node.get_subscriptions_info_by_topic(self._drawing.topic)
+        return frozenset(tuple(subscriber.endpoint_gid) for subscriber in every)
 
     def draw_for_listeners(self, marker_map: MarkerMap, in_view: frozenset[int], stamp_ns: int) -> None:
         """:meth:`draw` if there are subscribers."""
