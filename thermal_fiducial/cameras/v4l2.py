@@ -175,7 +175,9 @@ class V4l2Camera:
     def _accepted(self, buffer: api.Buffer) -> Counts | None:
         """A copy of the pixels of a filled buffer; None, and counted, if they are not all there."""
         if self._next_sequence is not None:
-            self.events['lost frames'] += (buffer.sequence - self._next_sequence) & 0x7FFFFFFF
+            # Of 32 bits; some drivers leave it at 0, others begin again.
+            lost = (buffer.sequence - self._next_sequence) & 0xFFFFFFFF
+            self.events['lost frames'] += lost if lost < 1 << 31 else 0
         self._next_sequence = buffer.sequence + 1
         if buffer.flags & api.FLAG_ERROR:
             self.events['scrambled frames'] += 1

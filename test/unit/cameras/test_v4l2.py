@@ -296,6 +296,18 @@ def test_damaged_and_lost_frames_are_counted_and_left_out():
     assert camera.events == {'scrambled frames': 1, 'short frames': 1, 'lost frames': 1}
 
 
+@pytest.mark.parametrize('numbers', [(0, 0, 0), (7, 8, 0), (2**32 - 1, 0, 1)])
+def test_numbers_of_frames_that_do_not_count_on_are_no_losses(numbers):
+    """A driver that leaves them at 0 counted two thousand million frames as lost with each one."""
+    kernel = FakeKernel()
+    camera = opened(kernel)
+    for number in numbers:
+        kernel.sequence = number - 1
+        kernel.capture(picture())
+        assert len(camera.read()) == 1
+    assert not camera.events['lost frames']
+
+
 def test_a_camera_that_is_unplugged_and_comes_back():
     kernel = FakeKernel()
     camera = opened(kernel)
