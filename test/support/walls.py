@@ -30,6 +30,12 @@ def wall(rng, count=8, tilt=0.1):
     }
 
 
+def hung(rng, position, yaw, tilt=0.1):
+    """T_map_marker of one unevenly hung, as on a wall x = const, at ``position``, both turned by ``yaw`` [rad]."""
+    R = so3_exp([0.0, 0.0, yaw])
+    return transform(R @ so3_exp(tilt * rng.normal(size=3)) @ _FACING, R @ position)
+
+
 def look(position, target, roll=0.0):
     """T_map_camera of a camera at ``position`` that looks at ``target``."""
     z = np.asarray(target, dtype=float) - position

@@ -35,14 +35,11 @@ from thermal_fiducial.files.map_history import digest, save_with_history
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.reading import require_regular
 from thermal_fiducial.files.recordings import LARGEST_SIGMA_PX, MOST_IDS
-from thermal_fiducial.map_tools import map_editing
 from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.map_tools.map_doubts import Doubt, doubts
 
 # Bound above all stamps [ns] and corners [px].
 _LARGEST_VALUE = 9.2e18
-# Standard deviations of entries without a covariance, which were written by hand.
-_HAND_STD_M, _HAND_STD_DEG = 0.1, 5.0
 # Share of the markers whose centres may lie outside the image: partially visible ones at its border.
 _MOST_OUTSIDE = 0.05
 # Dictionary of a new map, as the nodes take it.
@@ -155,7 +152,6 @@ def _grow(
     work: _MapInProgress,
     names: Sequence[str] = (),
 ) -> int:
-    start = map_editing.with_covariances(start, _HAND_STD_M, np.deg2rad(_HAND_STD_DEG))
     config = _mapper_config(args, start.dictionary)
     with progress_bar('mapping') as progress:
         built = build_map(

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig, MOST_KEYFRAMES
+from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, reproject
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
@@ -21,6 +22,10 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 # Most passes over all frames: more than a chain of markers needs, each seen only together with the previous one.
 _MAX_PASSES = 50
+# Variances [m^2, rad^2] of entries without a covariance, which somebody wrote by hand, before the views show them.
+_BY_HAND = np.array([0.1, np.deg2rad(5.0)]) ** 2
+# Most adjustments for the variances of such entries, and their relative change at convergence.
+_MAX_ROUNDS, _SETTLED = 5, 0.1
 # Initial covariance of an alternative pose in its bundle adjustment: practically unknown.
 _UNKNOWN = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 
@@ -50,7 +55,8 @@ def build_map(
     """Extend ``marker_map`` by all markers connected to it by common views, and run a bundle adjustment.
 
     The mapper processes all frames repeatedly until no pass adds a marker, since a frame without known markers may
-    become a link later. If the views leave a marker's pose ambiguous, a bundle adjustment with either pose decides.
+    become a link later. If the views leave a marker's pose ambiguous, a bundle adjustment with either pose decides. The
+    last adjustment claims what residuals in the adjusted map show, and not those in the map to start from.
 
     Parameters
     ----------
@@ -59,7 +65,9 @@ def build_map(
     """
     budget = min(max(len(frames), config.keyframe_budget), MOST_KEYFRAMES)
     config = replace(config, mode='mapping', keyframe_budget=budget)
-    mapper = MarkerMapper(config, marker_map)
+    by_hand = [key for key, m in marker_map.markers.items() if not m.fixed and not np.any(m.covariance)]
+    entries = {key: replace(marker_map.markers[key], covariance=_covariance(_BY_HAND)) for key in by_hand}
+    mapper = MarkerMapper(config, replace(marker_map, markers=marker_map.markers | entries))
     refinement = None
     waiting: dict[int, str] = {}
     for _ in range(_MAX_PASSES):
@@ -72,7 +80,11 @@ def build_map(
         if len(mapper.map.markers) == before and not _settle(mapper, camera):
             break
     unplaced = {key: why for key, why in waiting.items() if key not in mapper.map.markers}
-    unused, errors = _residuals(mapper.map, frames, camera, config)
+    unused, errors, systematic = _residuals(mapper.map, frames, camera, config)
+    snapshot = mapper.snapshot()
+    if refinement is not None and snapshot is not None:
+        refinement = _with_learned_errors(replace(snapshot, errors=systematic), by_hand) or refinement
+        mapper.apply(refinement)
     used = [rows for k, rows in enumerate(frames) if k not in unused]
     final = _with_statistics(mapper.map, used, marker_map, errors)
     return Built(final, refinement, unplaced, len(used), unused)
@@ -115,12 +127,43 @@ def decide(snapshot: Snapshot, marker_id: int, size: float, alternatives: Sequen
     return best
 
 
+def _with_learned_errors(snapshot: Snapshot, by_hand: Sequence[int]) -> AdjustedMap | None:
+    """The adjustment with priors of the entries ``by_hand`` that are as wide as these turn out to be off.
+
+    Expectation maximisation of their variances (A. Dempster, N. Laird, D. Rubin, 1977), with one entry more that is off
+    by what is assumed at first.
+    """
+    variances = _BY_HAND
+    for _ in range(_MAX_ROUNDS):
+        adjusted = refine(snapshot)
+        keys = [] if adjusted is None else [key for key in by_hand if key in adjusted.markers]
+        if adjusted is None or not keys:
+            break
+        off = np.stack([difference(snapshot.known[key][0], adjusted.markers[key].T_map_marker) for key in keys])
+        squares = np.stack([np.diag(adjusted.markers[key].covariance) for key in keys]) + off**2
+        before, variances = variances, (_BY_HAND + squares.reshape(-1, 2, 3).mean(axis=2).sum(axis=0)) / (1 + len(keys))
+        if np.all(np.abs(variances - before) < _SETTLED * before):
+            break
+        priors = {key: (snapshot.known[key][0], _covariance(variances)) for key in keys}
+        snapshot = replace(snapshot, known={**snapshot.known, **priors})
+    return adjusted
+
+
+def _covariance(variances: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a pose by the variances (2,) of each coordinate of position and rotation."""
+    return np.diag(np.repeat(variances, 3))
+
+
 def _residuals(
     built: MarkerMap, frames: Sequence[Markers], camera: Camera, config: MarkerMapperConfig
-) -> tuple[dict[int, str], dict[int, float]]:
-    """Frames that are not located in the map with the reason, and each marker's re-projection error in the others [px].
+) -> tuple[dict[int, str], dict[int, float], SystematicErrors]:
+    """What the frames show of the map once more.
 
-    The error is the median over the views; the mapper's own is a running mean from before the adjustment.
+    Returns
+    -------
+    Frames that are not located in the map with the reason; each marker's re-projection error in the others [px], the
+    median over the views, as the mapper's own is a running mean from before the adjustment; and the systematic errors
+    by residuals in this map: in one that was centimetres off, its errors were taken for those of corners.
     """
     mapper = MarkerMapper(replace(config, mode='localization'), built)
     unused, errors = dict[int, str](), defaultdict[int, list[float]](list)
@@ -136,7 +179,7 @@ def _residuals(
                 corners = corners_in_map(marker.T_map_marker, marker.size)
                 off = reproject(camera, pose.T_map_camera, corners) - seen
                 errors[marker_id].append(float(np.sqrt(np.mean(off**2))))
-    return unused, {marker_id: float(np.median(values)) for marker_id, values in errors.items()}
+    return unused, {marker_id: float(np.median(values)) for marker_id, values in errors.items()}, mapper.errors
 
 
 def _with_statistics(

@@ -159,17 +159,6 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[M
     return transformed(marker_map, T), dict(zip(common, distances.tolist(), strict=True))
 
 
-def with_covariances(marker_map: MarkerMap, position_std: float, rotation_std: float) -> MarkerMap:
-    """The map with standard deviations [m, rad] for markers that have no covariance and are not fixed.
-
-    The mapper would take such a marker for exact and never move it, which is not meant in a map written by hand.
-    """
-    covariance = np.diag([position_std**2] * 3 + [rotation_std**2] * 3)
-    exact = [key for key, m in marker_map.markers.items() if not m.fixed and not np.any(m.covariance)]
-    changed = {key: replace(marker_map.markers[key], covariance=covariance) for key in exact}
-    return replace(marker_map, markers={**marker_map.markers, **changed})
-
-
 def marker_of(marker_map: MarkerMap, marker_id: int) -> MapMarker:
     """The marker of an ID. Raises InputError if it is not in the map."""
     if marker_id not in marker_map.markers:

@@ -30,6 +30,10 @@ class Priors:
         """Those of a frame that lies at ``T_new_old`` (4, 4), a small transform."""
         return Priors(T_new_old @ self.T, self.information)
 
+    def divided(self, factor: float) -> 'Priors':
+        """Those whose covariances are this, once divided by a ``factor`` of all variances of an adjustment."""
+        return Priors(self.T, factor * self.information)
+
     def apart(self, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Differences (k, 6) from poses (k, 4, 4) to their priors, and chi squares (k,) of these."""
         d = difference(self.T, T)

@@ -45,7 +45,7 @@ class ErrorSources:
 
         Parameters
         ----------
-        widened : factor of the variances of corners and priors
+        widened : factor of all variances; covariances of priors come divided by it
         known : (M, 6, K) draws of the held markers; others are not used
         """
         of_odometry = np.zeros_like(known[:1])

@@ -82,7 +82,7 @@ class MarkerMapper:
 
     def _begin(self, marker_map: MarkerMap) -> None:
         self._bias = CornerBias()
-        self._initial, self.map = marker_map.copy(), marker_map.with_assumed_draws(self._errors)
+        self._initial, self.map = marker_map.copy(), marker_map.with_assumed_draws(self.errors)
         self._new = NewMarkers(self.config.marker_size, size_overrides(self.config.marker_size_overrides))
         self._consistency = Consistency(self.map.markers)
         #: the last pose that nothing contradicted
@@ -126,7 +126,7 @@ class MarkerMapper:
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.sizes):
             odometry, last = (None, self._last_at(stamp_ns)) if predicted is None else (predicted.pose, None)
-            fit = partial(locate, stamp_ns, camera=camera, model=self._errors, odometry=odometry, last=last)
+            fit = partial(locate, stamp_ns, camera=camera, model=self.errors, odometry=odometry, last=last)
             outcome = from_consistent_markers(sight, camera, predicted, fit)
         elif len(known.sizes):
             outcome = Refusal('all known markers in view are in quarantine')
@@ -146,7 +146,8 @@ class MarkerMapper:
         return replace(last, covariance=covariance)
 
     @property
-    def _errors(self) -> SystematicErrors:
+    def errors(self) -> SystematicErrors:
+        """Systematic errors as declared, those of corners as learned so far."""
         config = self.config
         return SystematicErrors(
             self._bias.px,
@@ -191,7 +192,7 @@ class MarkerMapper:
 
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, Waiting]:
         """Add views to the candidates of new markers; whether any entered the map, and what the others wait for."""
-        placed, waiting = self._new.show(frame.stamp_ns, frame.new, frame.camera, viewpoint, self._errors)
+        placed, waiting = self._new.show(frame.stamp_ns, frame.new, frame.camera, viewpoint, self.errors)
         self.map.markers |= {marker.id: marker for marker in placed}
         self.map.revision += bool(placed)
         return bool(placed), waiting
@@ -229,7 +230,7 @@ class MarkerMapper:
         ----------
         views : approximate largest number of views of markers, which bounds the time
         """
-        return self._keyframes.snapshot(self.map, self._errors, views)
+        return self._keyframes.snapshot(self.map, self.errors, views)
 
     def refine(self, views: int = sys.maxsize) -> AdjustedMap | None:
         """Run a bundle adjustment here, of so many ``views`` as :meth:`snapshot` takes, and apply it."""
