@@ -18,18 +18,17 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
-#: Models from the fewest parameters to the most: of equals the first is chosen.
-CANDIDATES = ('equidistant', 'plumb_bob', 'rational_polynomial')
-
 _FOLDS = 5
 # A share of the mean squared error that no one would notice.
 _NEAR_TIE = 0.02
-# Coefficients that enter together, each group's in their order: radial ones, then tangential ones.
+# Coefficients that enter together, each group's in their order: radial ones, then tangential ones. Models from the
+# fewest parameters to the most: of equals the first is chosen.
 _GROUPS: dict[str, tuple[tuple[tuple[int, ...], ...], ...]] = {
     'equidistant': (((0,), (1,), (2,), (3,)),),
     'plumb_bob': (((0,), (1,), (4,)), ((2, 3),)),
     'rational_polynomial': (((0, 5), (1, 6), (4, 7)), ((2, 3),)),
 }
+CANDIDATES = tuple(_GROUPS)
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,9 @@ class Pictures:
         #: when the next picture is due, by the monotonic clock [s]
         self._due = 0.0
         if not is_there(self._path):
-            raise InputError(f'camera {shown(path)}: no device in /dev, "teax", folder, picture or video')
+            raise InputError(
+                f'camera {shown(path)}: neither the name of a driver nor a device, folder, picture or video'
+            )
         if not any(True for _ in self._one_pass()):
             raise InputError(f'camera {path}: no 16-bit grey picture in it')
         self.events.clear()

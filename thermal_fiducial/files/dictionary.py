@@ -47,11 +47,11 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> Dictionary:
         bits = _unpacked(theirs.bytesList, theirs.markerSize)
         # OpenCV 4 has maxCorrectionBits 0 for the AprilTag families.
         return Dictionary(bits, max(theirs.maxCorrectionBits, correctable_bits(bits)))
-    path = _packaged().get(name, Path(name))
+    path = packaged().get(name, Path(name))
     try:
         text = read_text(path)
     except InputError:
-        close = difflib.get_close_matches(Path(name).name.upper(), [*_predefined(), *_packaged()], 1)
+        close = difflib.get_close_matches(Path(name).name.upper(), [*_predefined(), *packaged()], 1)
         hint = f'; did you mean {close[0]}?' if close else ''
         raise InputError(
             f'dictionary {name[:200]!r}: neither a dictionary of OpenCV nor a readable file{hint}'
@@ -67,7 +67,7 @@ def _predefined() -> list[str]:
     return [word for word in dir(cv2.aruco) if word.startswith('DICT_')]
 
 
-def _packaged() -> dict[str, Path]:
+def packaged() -> dict[str, Path]:
     """Dictionaries of the package by name."""
     return {path.stem: path for path in PACKAGED.glob('*.yaml')}
 
@@ -109,7 +109,7 @@ def dictionary_of_map(name: str, folder: Path) -> str:
     InputError
         Neither.
     """
-    if name in _predefined() or Path(name).name in _packaged():
+    if name in _predefined() or Path(name).name in packaged():
         return Path(name).name
     if name != Path(name).name:
         raise InputError(f'{name} is not opened, as it is neither a name nor a file beside the map')

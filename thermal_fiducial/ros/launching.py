@@ -35,7 +35,7 @@ _STOPPED, _REFUSED = (0, -signal.SIGPROF), 2
 _ARGUMENTS = {
     'params_file': ('', 'parameter file of the rig; default: the one of the package'),
     'map_file': ('', 'marker map; default: what the parameter file says'),
-    'camera': ('', 'start thermal_source with this camera: /dev/video0, teax, a folder; default: another driver runs'),
+    'camera': ('', 'start thermal_source with this camera: /dev/video0, a folder, ...; default: another driver runs'),
     'second_camera': ('', 'name of a second camera, the namespace of its images and detector; default: none'),
     'second_camera_device': (
         '',

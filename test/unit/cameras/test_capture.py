@@ -116,7 +116,7 @@ def test_the_name_of_a_camera_chooses_the_driver(camera, kind):
     ('changes', 'reason'),
     [
         ({}, 'parameter camera'),
-        ({'camera': '/home/nobody/pictures'}, 'no device'),
+        ({'camera': '/home/nobody/pictures'}, 'neither the name of a driver'),
         ({'camera': 'teax', 'image_width': 640}, 'both or none'),
     ],
 )

@@ -122,7 +122,7 @@ def test_a_video_of_16_bits(tmp_path):
 
 
 def test_what_is_no_source_is_refused(tmp_path):
-    with pytest.raises(InputError, match='no device'):
+    with pytest.raises(InputError, match='neither the name of a driver'):
         Pictures(str(tmp_path / 'nothing'))
     with pytest.raises(InputError, match='no 16-bit'):
         Pictures(str(tmp_path))

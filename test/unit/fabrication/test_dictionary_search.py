@@ -12,7 +12,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bit_patterns import cuttable, pack, rotate, unpack, weight
 from thermal_fiducial.fabrication.cuttability import examine
 from thermal_fiducial.fabrication.dictionary_search import distances, negatives, random_code, search
-from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.dictionary import load_dictionary, packaged
 from thermal_fiducial.files.dictionary import PACKAGED as FOLDER
 
 #: Packaged dictionary to bits along a side, least number of markers, distance.
@@ -180,6 +180,16 @@ def test_the_documents_name_the_markers_that_are_like_the_negative_of_another(na
     (listed,) = re.findall(rf'In `{name}`\s+these\b([^.]*)\.', page)
     pairs = [(int(a), int(b), bits_apart) for a, b in re.findall(r'(\d+)\s+and\s+(\d+)', listed)]
     assert pairs == negatives(bits, distances(bits)[0])
+
+
+def test_the_documents_have_each_dictionary_of_the_package():
+    page = (Path(__file__).resolve().parents[3] / 'doc' / 'markers.md').read_text(encoding='utf-8')
+    rows = re.findall(r'^\| `(\w+)` \| (\d+) \| (\d+) \| (\d+) bits? \|$', page, re.MULTILINE)
+    assert sorted(name for name, *_ in rows) == sorted(packaged())
+    for name, *shown in rows:
+        dictionary = load_dictionary(name)
+        is_so = [len(dictionary.bits), distances(dictionary.bits)[0], dictionary.correctable]
+        assert list(map(int, shown)) == is_so
 
 
 @pytest.mark.parametrize('name', ['STENCIL_4X4_80_SIGNED', 'STENCIL_5X5_100_SIGNED'])

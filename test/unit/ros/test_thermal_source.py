@@ -83,7 +83,9 @@ def test_without_a_camera_the_node_waits_and_reports_it(graph):
     assert (level, reason) == (ERROR, '/dev/video_that_is_not_there: No such file or directory')
 
 
-@pytest.mark.parametrize(('camera', 'words'), [('', 'parameter camera'), ('/nowhere/pictures', 'no device')])
+@pytest.mark.parametrize(
+    ('camera', 'words'), [('', 'parameter camera'), ('/nowhere/pictures', 'neither the name of a driver')]
+)
 def test_an_impossible_camera_is_a_fault(graph, camera, words):
     node = graph.add(ThermalSource, camera=camera)
     level, reason, _ = graph.diagnose(node)

@@ -6,22 +6,11 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import Counts, Gray, SECOND_NS
-from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.dictionary import load_dictionary, packaged
 
-#: Dictionaries that are looked for: those that the package cuts, and the usual ones of OpenCV, which hold the smaller
+#: Dictionaries that are looked for: all that the package ships, and the usual ones of OpenCV, which hold the smaller
 #: ones of their size. Larger ones (1000 markers of 4x4 bits) find their markers in anything.
-_USUAL = (
-    'STENCIL_4X4_100',
-    'DICT_4X4_250',
-    'STENCIL_5X5_100',
-    'DICT_5X5_250',
-    'STENCIL_6X6_100',
-    'DICT_6X6_250',
-    'DICT_APRILTAG_36h11',
-    'STENCIL_4X4_16',
-    'STENCIL_4X4_80_SIGNED',
-    'STENCIL_5X5_100_SIGNED',
-)
+_USUAL = (*sorted(packaged()), 'DICT_4X4_250', 'DICT_5X5_250', 'DICT_6X6_250', 'DICT_APRILTAG_36h11')
 #: Time between looks: each takes a blind search, two where it shows something.
 _PERIOD_NS = SECOND_NS
 #: Looks in a row that show the same marker of another dictionary: clutter that looks like one rarely does so for long.
