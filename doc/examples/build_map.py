@@ -19,6 +19,7 @@ def main(bag: str, parameters: str, start: str, out: str) -> None:
             pipeline.add_imu(item)
         else:
             pipeline.add_image(item.stamp_ns, item.counts)
+    pipeline.finish()
     marker_map = pipeline.mapper.map
     save_map(out, marker_map)
     for marker in marker_map.markers.values():
