@@ -23,20 +23,36 @@ TO_HEADING = re.compile(r'\]\(((?!\w+:)[^)#\s]*)#([^)\s]+)\)')
 PAGES = [README, *sorted((ROOT / 'doc').rglob('*.md'))]
 
 
-def test_the_design_names_files_that_are_there():
-    named = set(re.findall(r'`?([\w/]+\.py)\b', (ROOT / 'doc' / 'design.md').read_text(encoding='utf-8')))
-    assert len(named) > 50
-    files = [
-        f'/{path.relative_to(ROOT)}'
-        for folder in ('thermal_fiducial', 'test')
-        for path in (ROOT / folder).rglob('*.py')
-    ]
-    assert [name for name in sorted(named) if not any(file.endswith(f'/{name}') for file in files)] == []
+#: Pages that say where things are in the code.
+MAPS_OF_THE_CODE = [ROOT / 'doc' / f'{name}.md' for name in ('CONTRIBUTING', 'design', 'mechanisms')]
+SOURCES = [path for folder in ('thermal_fiducial', 'test') for path in (ROOT / folder).rglob('*.py')]
+
+
+def sources_named(name):
+    """The files whose path ends with ``name``."""
+    return [path for path in SOURCES if f'/{path.relative_to(ROOT)}'.endswith(f'/{name}')]
+
+
+@pytest.mark.parametrize('page', MAPS_OF_THE_CODE, ids=lambda page: page.stem)
+def test_the_design_names_files_that_are_there(page):
+    named = set(re.findall(r'`?([\w/]+\.py)\b', page.read_text(encoding='utf-8')))
+    assert named
+    assert [name for name in sorted(named) if not sources_named(name)] == []
+
+
+def test_what_to_open_names_functions_of_these_files():
+    page = (ROOT / 'doc' / 'CONTRIBUTING.md').read_text(encoding='utf-8')
+    pairs = re.findall(r'`([\w/]+\.py)` \(([^)]*)\)', page)
+    named = [(file, word) for file, words in pairs for word in re.findall(r'`(\w+)`', words)]
+    assert len(named) > 10
+    code = {file: '\n'.join(path.read_text(encoding='utf-8') for path in sources_named(file)) for file, _ in named}
+    assert [f'{file}: {word}' for file, word in named if not re.search(rf'\b{word}\b', code[file])] == []
 
 
 def test_the_design_names_functions_that_are_there():
-    text, _, _ = (ROOT / 'doc' / 'design.md').read_text(encoding='utf-8').partition('## Conventions')
-    named = set(re.findall(r'`(\w+)`', text))
+    design, contributing = (page.read_text(encoding='utf-8') for page in (MAPS_OF_THE_CODE[1], MAPS_OF_THE_CODE[0]))
+    to_open = contributing.partition('\n## To change')[2].partition('\n## ')[0]
+    named = set(re.findall(r'`(\w+)`', design.partition('## Conventions')[0] + to_open))
     assert len(named) > 80
     code = '\n'.join(file.read_text(encoding='utf-8') for file in (ROOT / 'thermal_fiducial').rglob('*.py'))
     words = set(re.findall(r'\w+', code)) | {file.stem for file in (ROOT / 'test').rglob('*.py')}
@@ -138,6 +154,16 @@ def test_the_list_of_decisions_has_each_once_and_says_what_revises_it():
         if re.match('Revises|Supersedes|Replaces', opening):
             first = re.search(r'\]\((\d{4}-[^)]+)\)', opening)
             assert f'({record.name})' in listed[first[1]].split('; revised by')[1]
+
+
+def test_the_groups_of_decisions_say_what_holds_and_are_in_order():
+    text = (ROOT / 'doc' / 'decisions' / 'index.md').read_text(encoding='utf-8')
+    for group in text.split('\n## ')[1:]:
+        numbers = [int(number) for number in re.findall(r'^- \[(\d+)\. ', group, re.MULTILINE)]
+        assert numbers == sorted(numbers)
+        holds = set(map(int, re.findall(r'\[(\d+)\]', group.partition('\n- [')[0])))
+        assert holds
+        assert holds <= {int(path.name[:4]) for path in (ROOT / 'doc' / 'decisions').glob('[0-9]*.md')}
 
 
 def shown(program):
