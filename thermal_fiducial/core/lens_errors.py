@@ -50,7 +50,7 @@ class LensErrors:
 
 
 def _modes(places: FloatArray, size: int, length: float) -> FloatArray:
-    """(..., I) factors of the process along one axis of an image at ``places`` (...) [px]."""
+    """Values (..., I) at ``places`` (...) [px] of functions of one axis: the smooth error is a random sum of them."""
     nodes, to_modes = _nodes(size, length)
     return np.asarray(np.exp(-0.5 * np.square((places[..., None] - nodes) / length)) @ to_modes)
 

@@ -197,6 +197,7 @@ class Decoder:
         return 1.0 - self._grids.reshape(-1, self.cells, self.cells)
 
     def _judged(self, match: PatternMatch, steps: FloatArray) -> Reading:
+        """Contrast and wrong bits of the best match; ``steps`` (Q, 4): from the border outwards on each side."""
         expected = self._grids.reshape(-1, self.cells**2)[match.best]
         shape = expected @ self._detrend
         contrast = np.sum(match.values * shape, axis=1) / np.maximum(np.sum(shape * shape, axis=1), TINY)

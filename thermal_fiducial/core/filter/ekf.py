@@ -250,6 +250,7 @@ class PoseEkf:
         return self._clock_offset(main)
 
     def _clock_offset(self, main: Hypothesis) -> float:
+        """Estimate of t_imu - t_camera [s], for stamps as the camera gives them."""
         steps = self._camera_clock.ahead_ns / SECOND_NS
         return self._first_offset + main.estimate.state.time_offset - steps
 

@@ -164,7 +164,7 @@ class History:
             self._stepped = self.main._replace(estimate=replace(before, stamp_ns=before.stamp_ns + size_ns))
 
     def explain_jump(self) -> None:
-        """The clock of the IMU has not stepped: samples are lost."""
+        """Drop what :meth:`suspect_jump` allowed for: poses show that samples were lost, the clock has not stepped."""
         self._stepped = None
 
     def forget_poses(self) -> None:

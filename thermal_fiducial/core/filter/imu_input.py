@@ -138,6 +138,7 @@ class ImuInput:
         return run.first_ns - self._last_ns if among and run.count >= GAP_EVIDENCE else 0
 
     def _follow(self, stamp_ns: int, jump_ns: int = 0) -> None:
+        """Take a sample as the last one: what its step says of usual steps, and of steps of the clock."""
         assert self._last_ns is not None
         step_ns = stamp_ns - self._last_ns
         gap_ns = jump_ns or step_ns
@@ -152,6 +153,7 @@ class ImuInput:
         self._last_ns, self._strays, self.jump_ns = stamp_ns, None, jump_ns
 
     def _stray(self, stamp_ns: int) -> Verdict:
+        """Verdict on a sample whose stamp does not follow the last one: enough of them in a row are right."""
         assert self._last_ns is not None
         run = self._strays
         if run is not None and run.first_ns <= stamp_ns <= run.last_ns:

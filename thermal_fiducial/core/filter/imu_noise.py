@@ -207,6 +207,7 @@ class NoiseFloor:
         self._bands = inside / inside.sum(axis=1, keepdims=True) * scale
 
     def _measure(self) -> None:
+        """Take the spectrum of a full window into the mean, and the noise densities from its quietest band."""
         samples = np.array(self._samples)
         differences = samples[:-2] - 2.0 * samples[1:-1] + samples[2:]
         spectrum = np.abs(np.fft.rfft(differences * self._window, axis=0)) ** 2

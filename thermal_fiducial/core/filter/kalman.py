@@ -32,6 +32,7 @@ def _load() -> Any:
 
 
 def _load_alone(places: list[str]) -> Any:
+    """The class alone, from the package at ``places``: shells stand for what would be imported beside it."""
     shells = {
         name: ModuleType(name) for name in (_NAME, *(f'{_NAME}.{part}' for part in ('kalman', 'common', 'stats')))
     }

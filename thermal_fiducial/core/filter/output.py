@@ -153,6 +153,7 @@ def condition_of(history: History, config: PoseEkfConfig) -> Condition:
 
 
 def _without_estimate(belief: Belief, config: PoseEkfConfig) -> Condition:
+    """The condition before there is an estimate: what contradicts the poses, how many agree, or that none has come."""
     if belief.contradiction is not None:
         return belief.contradiction
     begun = belief.alternative

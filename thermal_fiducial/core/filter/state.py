@@ -189,7 +189,7 @@ def embedded_core(error: FloatArray) -> FloatArray:
 
 
 def clock_offset_derivative(derivative: FloatArray) -> FloatArray:
-    """(54,) error by 1 s of clock offset with which the state at the camera's stamps is right.
+    """(54,) error coordinates of 1 s of clock offset that leaves the state at the camera's stamps as it is.
 
     ``derivative`` (9,): of the core, :meth:`NavigationState.derivative`.
     """

@@ -156,6 +156,7 @@ def robust(squared: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _solve(information: FloatArray, damping: FloatArray, gradient: FloatArray) -> FloatArray:
+    """Levenberg-Marquardt steps (N, 6); ``damping`` (N,) is relative to the diagonals of ``information`` (N, 6, 6)."""
     damped = information.copy()
     diagonal = damped.reshape(-1, 36)[:, ::7]
     floor = SINGULAR * np.maximum(diagonal.max(axis=-1, keepdims=True), SINGULAR)

@@ -31,6 +31,7 @@ class EightBitView:
         return np.asarray(cv2.convertScaleAbs(above, alpha=255.0 / span), dtype=np.uint8)
 
     def _follow(self, counts: Counts) -> tuple[float, float]:
+        """Lower and upper end of the scale [counts], moved towards the percentiles of this frame."""
         sample = counts[:: self.STEP, :: self.STEP].ravel()
         share = self.config.view_tail_percent / 100.0
         ranks = (int(share * (sample.size - 1)), int((1.0 - share) * (sample.size - 1)))

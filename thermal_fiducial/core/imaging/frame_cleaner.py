@@ -163,6 +163,7 @@ class FrameCleaner:
         return frame[extra:] if self._telemetry_on_top > 0 else frame[: height - extra]
 
     def _replace_bad_pixels(self, image: Counts) -> None:
+        """Fill listed pixels and those found so far, in place."""
         assert self._filler is not None
         if self.config.find_bad_pixels:
             found = self._finder.add(image)

@@ -255,6 +255,7 @@ def inconsistent(disagrees: np.ndarray, markers: Sequence[MapMarker]) -> np.ndar
 
 
 def _preference(a: MapMarker, b: MapMarker) -> int:
+    """1 if ``a`` is preferred to ``b``, -1 the other way round, 0: neither; by survey, then by observations."""
     if a.fixed != b.fixed:
         return 1 if a.fixed else -1
     if a.observations > 4 * b.observations:

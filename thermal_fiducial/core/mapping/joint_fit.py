@@ -141,7 +141,7 @@ class JointFit:
         return Location(pose, sight, reprojection, weights, map_gains, lens, white, of_scales, by_corner)
 
     def decisive_weights(self, found: Location) -> FloatArray:
-        """Weights (N,) of the markers beside those of odometry: with the bias of the corners and what a fit leaves."""
+        """Weights (N,) of the markers against odometry: with the bias of corners, and residuals above their claims."""
         relative = found.weights / found.weights.max() * decision_weights(self.sight.noise_px, self.model)
         _, chi2 = self._weighted(found.reprojection, relative)
         return np.asarray(relative / noise_factor(chi2, 8 * len(relative) - 6))

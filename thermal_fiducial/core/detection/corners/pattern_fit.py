@@ -309,14 +309,14 @@ def _gradient(at: PatternResiduals) -> FloatArray:
 
 
 def _solvable(information: FloatArray) -> FloatArray:
-    """Information (Q, K, K) that has an inverse where the image has no gradient in some direction."""
+    """``information`` (Q, K, K), in place, so that it has an inverse where the image has no gradient in a direction."""
     diagonal = np.einsum('qii->qi', information)
     diagonal += _SINGULAR * (1.0 + diagonal.max(axis=1, keepdims=True))
     return information
 
 
 def _step(information: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Step (Q, K) of Gauss and Newton."""
+    """Gauss-Newton step (Q, K)."""
     return np.asarray(-np.linalg.solve(information, gradient)[..., 0], dtype=np.float64)
 
 

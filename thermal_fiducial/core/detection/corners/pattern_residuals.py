@@ -72,12 +72,12 @@ class Unevenness(Stacked):
         return Unevenness(differing, (of_contrast * contrast / length).astype(np.float32))
 
     def left(self, rest: Float32Array) -> Float32Array:
-        """What the differences that residuals (Q, n * n, P / (n * n)) show leave of these: the inverse covariance's."""
+        """Residuals (Q, n * n, P / (n * n)) times their inverse covariance: less what is uneven in each patch."""
         shown = self.differing @ (rest[:, :, None] @ self.differing).swapaxes(2, 3)
         return np.asarray(rest - shown[..., 0])
 
     def information(self, J: Float32Array) -> Float32Array:
-        """What of the information (Q, K, K) by derivatives (Q, K, P) the differences take."""
+        """Information (Q, K, K) that uneven levels and contrasts take from K parameters with derivatives (Q, K, P)."""
         count, patches, size = self.differing.shape[:3]
         by_patches = J.reshape(count, -1, patches, size).swapaxes(1, 2) @ self.differing
         together = by_patches.swapaxes(1, 2).reshape(count, J.shape[1], -1)
@@ -90,7 +90,7 @@ def _sums(patches: Float32Array) -> Float32Array:
 
 
 def _beyond(amounts: FloatArray, noise: FloatArray, strength: FloatArray) -> FloatArray:
-    """Variance (Q, 1) v of amounts (Q, N) whose variances are that of the ``noise`` and v times ``strength``."""
+    """Estimate v (Q, 1) from amounts (Q, N) with variances of ``noise + v * strength``, by their second moments."""
     excess = (strength * (amounts * amounts - noise)).sum(axis=1, keepdims=True)
     return np.asarray(np.maximum(excess, 0.0) / (strength * strength).sum(axis=1, keepdims=True))
 
@@ -129,7 +129,7 @@ class PatternResiduals(Stacked):
         return replace(self, rest=rest, weighted=_weighted(rest, self.unevenness))
 
     def sample_at(self, view: PatternView, quads: FloatArray, which: IntArray) -> None:
-        """Move ``which`` (W,) to corners ``quads`` (W, 4, 2) so near that the patterns on them stay."""
+        """Sample the image again at corners ``quads`` (W, 4, 2) of ``which`` (W,), so near that the patterns stay."""
         view = view.only(which)
         samples = _samples(view.values(*view.places(quads, self.grid)), self.grid, self.known[which])
         uneven = self.unevenness and self.unevenness.only(which)
@@ -220,6 +220,7 @@ def products_of(rows: Float32Array) -> FloatArray:
 
 
 def _weighted(rest: Float32Array, uneven: Unevenness | None) -> Float32Array:
+    """Residuals (Q, P) times their inverse covariance, for noise with a variance of 1."""
     if uneven is None:
         return rest
     return uneven.left(rest.reshape(uneven.differing.shape[:3])).reshape(rest.shape)

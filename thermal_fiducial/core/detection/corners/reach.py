@@ -46,7 +46,7 @@ class Reach(Stacked):
 
     @property
     def near(self) -> BoolArray:
-        """Which markers (N,) have near pixels only."""
+        """Which markers (N,) are measured by pixels near their sides alone."""
         return np.asarray(np.isfinite(self.inside).any(axis=1))
 
     def limits(self, sides: Sides, width: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -258,7 +258,7 @@ def adjust(sides: Sides, segments: Segments) -> tuple[FloatArray, FloatArray]:
 
 @cache
 def _shares(cells: int) -> FloatArray:
-    """Shares (4, m, 4) of the corners in segments: parts of a side, between the corners that it begins and ends at."""
+    """Weights (4, m, 4) of the four corners in the middle of each of m segments of a side, by linear interpolation."""
     return np.asarray(_AT_START + ((np.arange(cells) + 0.5) / cells)[:, None] * _ONWARD)
 
 

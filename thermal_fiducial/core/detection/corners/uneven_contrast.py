@@ -51,6 +51,7 @@ class _Perimeter(NamedTuple):
 
 @cache
 def _perimeter(cells: int) -> _Perimeter:
+    """The segments of a marker of ``cells`` along a side, in its frame of unit side."""
     along, end = (np.arange(cells) + 0.5) / cells - 0.5, np.full(cells, 0.5)
     x, y = np.concatenate([along, along, -end, end]), np.concatenate([-end, end, along, along])
     across_x = np.repeat([False, False, True, True], cells)

@@ -111,6 +111,7 @@ class PartialMarkerSearch:
         return np.array(ids, dtype=np.int64), found
 
     def _one(self, frame: Frame, marker: _PartialMarker, config: ArucoDetectorConfig) -> RefinedCorners | None:
+        """Corners of a marker by a fit at low, then at full resolution; None if it does not show its pattern."""
         points = on_marker(self._visible.places, marker.size)
         factor = int(2 ** np.clip(np.floor(np.log2(marker.cell_px / _COARSE_PX)), 0, 3))
         coarse = layer_of(frame, marker.window_in_camera(), config.blur_px, factor)
