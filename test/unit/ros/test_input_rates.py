@@ -41,6 +41,13 @@ def test_a_rate_that_was_given_counts_from_the_first_full_window():
     assert watched([100] * 12, expected=200.0).doubt() == 'main at 100 Hz, 200 expected'
 
 
+def test_an_input_that_is_back_has_the_rate_that_it_comes_at():
+    """A camera that was unplugged for 20 s and was back was said to be at 3 Hz, and at less than 30 for 10 s."""
+    back = watched([30] * 12 + [0] * 20 + [30] * 4)
+    assert (back.doubt(), back.figures()['rate /main [Hz]']) == ('', '30')
+    assert watched([30] * 12 + [0] * 20 + [15] * 12).doubt() == 'main at 15 Hz, 30 expected'
+
+
 def test_a_shutter_event_is_no_doubt():
     assert watched([30] * 10 + [14] + [30] * 5).doubt() == ''
 

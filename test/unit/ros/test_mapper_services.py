@@ -103,7 +103,7 @@ def test_a_map_file_that_was_mended_and_loaded_is_no_fault_any_more(graph, map_f
     assert (level, 'not valid YAML' in reason) == (ERROR, True)
     map_file.write_text(text)
     assert ask(graph, 'load')[0]
-    assert graph.diagnose(node)[:2] == (WARN, 'no markers')
+    assert graph.diagnose(node)[:2] == (WARN, 'nothing on markers')
 
 
 def test_a_full_disk_at_undo_costs_neither_the_map_nor_its_history_nor_the_node(graph, map_file, monkeypatch):

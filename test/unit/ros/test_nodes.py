@@ -141,6 +141,20 @@ def test_a_truncated_image_is_refused_and_the_next_one_taken(graph):
     assert (level, figures['published /thermal/image']) == (OK, '1')
 
 
+def test_a_reason_that_stays_the_same_is_logged_once_in_half_a_minute(graph, capfd):
+    """A driver of the wrong encoding wrote a line a second, for as long as it ran."""
+    node = graph.add(Tau2Camera)
+    (color,) = frames(1)
+    color.encoding = 'bgr8'
+    (short,) = frames(1)
+    short.data = short.data[:1000]
+    for message in [color] * 32 + [short]:
+        graph.send('thermal/image_raw', message)
+        graph.diagnose(node)
+    lines = [line for line in capfd.readouterr().err.splitlines() if '[tau2_camera]' in line]
+    assert ['bgr8' in line for line in lines] == [True, True, False]
+
+
 def test_an_unexpected_exception_is_reported_and_the_next_image_used(graph, monkeypatch):
     node = graph.add(Tau2Camera)
     first, second = frames(2)
@@ -596,14 +610,14 @@ def test_poses_that_have_stopped_are_not_taken_for_another_clock(graph):
 
 def test_an_input_without_messages_is_reported(graph):
     node = graph.add(PoseEkfNode)
-    assert graph.diagnose(node)[:2] == (WARN, 'no imu/data')
+    assert graph.diagnose(node)[:2] == (WARN, 'nothing on imu/data')
 
 
 def test_an_input_that_stops_is_an_error_after_two_seconds(graph):
     node = graph.add(PoseEkfNode)
     fly(graph, [imu(0)])
     levels = [graph.diagnose(node)[:2] for _ in range(3)]
-    assert levels[1:] == [(WARN, 'no imu/data'), (ERROR, 'no imu/data')]
+    assert levels[1:] == [(WARN, 'nothing on imu/data'), (ERROR, 'nothing on imu/data')]
     fly(graph, [imu(1)])
     assert graph.diagnose(node)[1] == levels[0][1] == 'waiting for markers'
 

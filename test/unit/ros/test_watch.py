@@ -63,7 +63,7 @@ STATES = [
     ({'tau2_camera': (1, 'FFC')}, Advice.FLY, ''),
     ({'pose_ekf': (1, 'coasting: 1.2 s without a pose')}, Advice.CARE, 'coasting: 1.2 s without a pose'),
     ({'marker_mapper': (1, 'quarantined: 7')}, Advice.CARE, 'marker_mapper: quarantined: 7'),
-    ({'tau2_camera': (2, 'no thermal/image_raw')}, Advice.CARE, 'tau2_camera: no thermal/image_raw'),
+    ({'tau2_camera': (2, 'frozen')}, Advice.CARE, 'tau2_camera: frozen'),
     ({'pose_ekf': (2, 'lost: position known to 0.41 m')}, Advice.STOP, 'lost: position known to 0.41 m'),
 ]
 

@@ -22,7 +22,7 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 
 #: Reason of a reset after a jump of the IMU's stamps, and of poses that wait until it is explained.
-CLOCK_JUMPED = "the IMU's clock has jumped"
+CLOCK_JUMPED = 'samples of the IMU are missing, or its clock has jumped'
 
 
 class PoseEkf:

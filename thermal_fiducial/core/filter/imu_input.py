@@ -37,7 +37,7 @@ class Verdict(Enum):
     NOT_FINITE = Condition('IMU sample is not finite')
     IMPOSSIBLE = Condition('IMU sample far beyond the range of its sensors')
     FROZEN = Condition('IMU is frozen', 'the same value again and again')
-    REPEATED = Condition('IMU stamp repeated')
+    REPEATED = Condition('IMU stamp repeated', 'two publishers, or a driver that sets none?')
     BACKWARD = Condition('IMU stamp went back')
     AHEAD = Condition('IMU stamp jumped ahead')
     RESTART = Condition('IMU clock jumped', 'reset')

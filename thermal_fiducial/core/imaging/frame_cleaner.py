@@ -24,7 +24,7 @@ from thermal_fiducial.errors import InputError
 FROZEN = 'frozen'
 SHUTTER = 'FFC'
 SETTLING = 'settling after FFC'
-REPEATED_STAMP = 'stamp seen before'
+REPEATED_STAMP = 'stamp seen before: two publishers, or a driver that sets none?'
 
 # Least shift of counts by drivers that fill 16 bits.
 _SHIFTED = 2

@@ -36,6 +36,8 @@ _ROBOT_FRAMES = ('base_frame', 'camera_frame', 'odom_frame', 'frame_id')
 _RATES = ('image_rate', 'imu_rate')
 #: Longest error message [characters] on console and in diagnostics: it may quote input of any length.
 _LONGEST_REASON = 400
+#: Diagnostics, one a second, after which the console repeats why messages are refused if it is still the same.
+_REPEATED_AFTER = 30
 
 
 class StageNode(CountingNode, Generic[Config]):
@@ -86,6 +88,8 @@ class StageNode(CountingNode, Generic[Config]):
         self.refused = 0
         self.last_refusal = ''
         self._diagnosed_refused = 0
+        # What the console has said of refusals, and how many diagnostics ago.
+        self._logged_refusal, self._since_logged = '', 0
         self._rates = InputRates(self.inputs, _expected_rate(self.config))
         #: why the node cannot go on in this process; see ``run``
         self.deaf = ''
@@ -178,8 +182,10 @@ class StageNode(CountingNode, Generic[Config]):
         return f'{INTERNAL_ERROR}: {type(error).__name__}: {one_line(error)}'
 
     def refuse(self, reason: str) -> None:
-        """Count a refused message; at most one between two diagnostics is logged."""
-        if self.refused == self._diagnosed_refused:
+        """Count a refused message; at most one between two diagnostics is logged, and the same one more seldom."""
+        first = self.refused == self._diagnosed_refused
+        if first and (reason != self._logged_refusal or self._since_logged >= _REPEATED_AFTER):
+            self._logged_refusal, self._since_logged = reason, 0
             self.get_logger().warning(reason)
         self.refused += 1
         self.last_refusal = reason
@@ -224,6 +230,7 @@ class StageNode(CountingNode, Generic[Config]):
         name = self.get_fully_qualified_name().lstrip('/')
         self._diagnostics.send(convert.diagnostics(name, level, reason, values, stamp_ns))
         self._diagnosed_refused = self.refused
+        self._since_logged += 1
 
     @property
     def _on_sim_time(self) -> bool:
@@ -243,7 +250,7 @@ class StageNode(CountingNode, Generic[Config]):
         if self.refused > self._diagnosed_refused:
             return WARN, self.last_refusal
         if self._rates.silent:
-            return ERROR if self._rates.stopped else WARN, f'no {self._rates.main}'
+            return ERROR if self._rates.stopped else WARN, f'nothing on {self._rates.main}'
         level, reason = self.state()
         doubts = [*filter(None, [self._rates.doubt()]), *without_effect(self.config), *self.remarks]
         return (max(level, WARN), '; '.join([reason, *doubts])) if doubts else (level, reason)

@@ -72,7 +72,9 @@ class MapCorrections:
         def on_error(message: bytes) -> None:
             self.note_error(message_bytes.map_error(message))
 
-        node.subscribe_lazily(PoseWithCovarianceStamped, 'camera_pose/map_error', on_error, qos.RESULT)
+        errors = node.subscribe_lazily(PoseWithCovarianceStamped, 'camera_pose/map_error', on_error, qos.RESULT)
+        # It comes with each pose: that there are none is said of these.
+        errors.regular = False
         self.follow_moves(node, on_moved)
 
     def follow_moves(self, node: CountingNode, on_moved: Callable[[FloatArray], None] | None = None) -> None:
