@@ -15,7 +15,7 @@ import numpy as np
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.state import Estimate, POSITION
 from thermal_fiducial.core.measurements import Condition
-from thermal_fiducial.core.types import SECOND_NS
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Poses that the alternative must accept for each one that the estimate accepts: an estimate with a wrong clock offset
 #: still accepts some when the robot slows down.
@@ -70,6 +70,10 @@ class Hypothesis(NamedTuple):
     #: number of latest poses accepted in a row, or refused in a row
     accepted_in_row: int = 1
     refused_in_row: int = 0
+    #: innovation (6,) of the latest refused pose
+    against: FloatArray | None = None
+    #: squared standard deviations by which the poses accepted since would have shown an error as that one claims
+    shown: float = 0.0
     #: of an alternative: poses that it must accept before it may replace the estimate
     needed: int = 0
 
@@ -83,14 +87,20 @@ class Hypothesis(NamedTuple):
             refused_in_row=0,
         )
 
-    def refusing(self, estimate: Estimate) -> 'Hypothesis':
-        """The hypothesis after a refused pose."""
+    def refusing(self, estimate: Estimate, innovation: FloatArray) -> 'Hypothesis':
+        """The hypothesis after a refused pose with its ``innovation`` (6,)."""
         return self._replace(
             estimate=estimate,
             misses=self.misses + 1,
             accepted_in_row=0,
             refused_in_row=self.refused_in_row + 1,
+            against=innovation,
+            shown=0.0,
         )
+
+    def staying_in_doubt(self, estimate: Estimate, shown: float) -> 'Hypothesis':
+        """The hypothesis after an accepted pose that would not have shown what the refused ones claim."""
+        return self._replace(estimate=estimate, accepted_ns=estimate.stamp_ns, shown=shown)
 
     @property
     def in_doubt(self) -> bool:

@@ -36,16 +36,31 @@ def weigh(
 ) -> tuple[Hypothesis, PoseUpdate]:
     """A hypothesis after a pose with a camera stamp, and the verdict on the pose.
 
-    One that has coasted longer than ``reinitialise_after`` must not be corrected any more.
+    One that has coasted longer than ``reinitialise_after`` must not be corrected any more. One in doubt stays so until
+    the poses that it accepts would have shown the error that the refused ones claim: a pose of a single marker may be
+    so vague that it agrees with an estimate which is metres off.
     """
     estimate, nis = innovation.estimate, innovation.nis
     coasted = (estimate.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
     stale = coasted > config.reinitialise_after
     if nis <= config.gate and not stale:
-        return hypothesis.accepting(corrected(config, innovation)), PoseUpdate(stamp_ns, True, '', nis)
-    refusing = hypothesis.refusing(replace(estimate, pose_noise=adapted_noise(innovation)))
+        accepted, after = PoseUpdate(stamp_ns, True, '', nis), corrected(config, innovation)
+        if hypothesis.in_doubt and (shown := _shown(hypothesis, innovation)) <= config.gate:
+            return hypothesis.staying_in_doubt(after, shown), accepted
+        return hypothesis.accepting(after), accepted
+    refusing = hypothesis.refusing(replace(estimate, pose_noise=adapted_noise(innovation)), innovation.value)
     why = f'after {coasted:.0f} s without one' if stale else f'{math.sqrt(nis):.1f} sigma'
     return refusing, PoseUpdate(stamp_ns, False, f'refused: {why}', nis)
+
+
+def _shown(hypothesis: Hypothesis, innovation: Innovation) -> float:
+    """NIS that the poses accepted since the latest refused one would have together if they were off as that one.
+
+    Without that of its noise, which is all that a vague pose has: its mean is the number of degrees of freedom.
+    """
+    if (against := hypothesis.against) is None:
+        return math.inf
+    return hypothesis.shown + max(0.0, float(against @ innovation.S_inverse @ against) - len(against))
 
 
 def contradiction(config: PoseEkfConfig, hypothesis: Hypothesis, innovation: Innovation) -> Condition:

@@ -41,7 +41,7 @@ BELIEF = Belief(main=REFUSING, alternative=AGREEING, hits_before=30)
 
 def test_a_verdict_counts_and_ends_the_run_of_the_others():
     begun = hypothesis()
-    after = begun.accepting(known_to(0.01, FRAME_NS)).refusing(known_to(0.02, 2 * FRAME_NS))
+    after = begun.accepting(known_to(0.01, FRAME_NS)).refusing(known_to(0.02, 2 * FRAME_NS), np.ones(6))
     assert (after.hits, after.misses, after.accepted_in_row, after.refused_in_row) == (2, 1, 0, 1)
     assert (after.started_ns, after.accepted_ns, after.estimate.stamp_ns) == (0, FRAME_NS, 2 * FRAME_NS)
     again = after.accepting(known_to(0.01, 3 * FRAME_NS))
@@ -51,7 +51,7 @@ def test_a_verdict_counts_and_ends_the_run_of_the_others():
 def test_doubt_begins_with_refusals_in_a_row():
     begun = hypothesis()
     for count in range(1, REFUSALS_OF_DOUBT + 2):
-        begun = begun.refusing(begun.estimate)
+        begun = begun.refusing(begun.estimate, np.ones(6))
         assert begun.in_doubt == (count >= REFUSALS_OF_DOUBT)
     assert not begun.accepting(begun.estimate).in_doubt
 

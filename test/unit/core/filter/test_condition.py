@@ -73,6 +73,23 @@ def test_poses_that_are_refused_in_a_row_put_it_in_doubt():
     assert condition_of(kept, CONFIG).details == '5 poses in a row contradict the estimate'
 
 
+@pytest.mark.parametrize(('std', 'accepted', 'ends'), [(5.0, 12, False), (0.005, 2, True)])
+def test_doubt_ends_with_poses_that_would_have_shown_the_error(std, accepted, ends):
+    """With forces in g, poses of one marker that claimed 50 m agreed with an estimate 50 m off, which was sent."""
+    kept = history(1.5, slice(5, 20))
+    poses = Flight(seed=1, seconds=4.0, motion=Motion.still()).poses[20 : 24 + accepted]
+    for count, pose in enumerate(poses):
+        T, covariance = pose.T_map_camera.copy(), pose.covariance.copy()
+        if count < 4:
+            T[0, 3] += 3.0
+        else:
+            covariance[:3, :3] = std**2 * np.eye(3)
+        kept.insert(type(pose)(pose.stamp_ns, T, covariance))
+        kept.take_in()
+    assert [kept.log.latest[pose.stamp_ns].accepted for pose in poses] == [False] * 4 + [True] * accepted
+    assert kept.main.in_doubt is not ends
+
+
 def test_a_sensor_that_poses_contradict_is_named_until_the_filter_is_initialised():
     upside_down = history(1.0, slice(10, 11), force=-1.0)
     condition = condition_of(upside_down, CONFIG)
