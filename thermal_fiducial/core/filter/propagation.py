@@ -35,9 +35,6 @@ from thermal_fiducial.core.filter.state import (
 from thermal_fiducial.core.geometry.se3 import SKEW
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: Terms of the exponential's series: exact to 1e-13 for a turn of 0.03 rad, of a brisk flight sampled at 100 Hz, and to
-#: 2e-10 for 0.1 rad, over a gap.
-_DIVISORS = np.arange(6.0, 1.0, -1.0)[:, None, None, None]
 _IDENTITY = np.eye(9)
 #: Longest time of coasting that is looked ahead [s], and its resolution [s]. A time of hover is divided into so many
 #: steps: the exponential is exact for any, the deviation by white noise and walks to 3 per mille.
@@ -45,17 +42,17 @@ HORIZON, _TICK, _STEPS = 60.0, 0.05, 10
 
 
 def _generators() -> FloatArray:
-    """(7, 81) basis of the generator: (rate, force, 1) @ basis is A (9, 9), row by row."""
-    basis = np.zeros((7, 9, 9))
+    """(6, 81) basis of the generator by rate and force, row by row."""
+    basis = np.zeros((6, 9, 9))
     crosses = SKEW.reshape(3, 3, 3)
     for place in (ROTATION, VELOCITY, POSITION):
         basis[:3, place, place] = -crosses
     basis[3:6, VELOCITY, ROTATION] = -crosses
-    basis[6, POSITION, VELOCITY] = np.eye(3)
-    return basis.reshape(7, 81)
+    return basis.reshape(6, 81)
 
 
-_GENERATORS = _generators()
+_BY_IMU, _BY_VELOCITY = _generators(), np.zeros((9, 9))
+_BY_VELOCITY[POSITION, VELOCITY] = np.eye(3)
 
 
 class StepMatrices(NamedTuple):
@@ -67,16 +64,13 @@ class StepMatrices(NamedTuple):
 
 def step_matrices(imu: FloatArray, seconds: FloatArray) -> StepMatrices:
     """Matrices of steps of constant rate and specific force ``imu`` (N, 6) that last ``seconds`` (N,)."""
-    dt = seconds[:, None]
-    A_dt = np.concatenate((imu * dt, dt), axis=1) @ _GENERATORS
-    A_dt = A_dt.reshape(-1, 9, 9)
-    # Horner's scheme for the mean of the exponential over the step, sum_k (A dt)^k / (k + 1)!
-    first, *others = A_dt / _DIVISORS
-    mean = _IDENTITY + first
-    for factor in others:
-        mean = factor @ mean
-        mean += _IDENTITY
-    return StepMatrices(_IDENTITY + A_dt @ mean, mean[..., :6] * dt[..., None])
+    dt = seconds[:, None, None]
+    A = ((imu @ _BY_IMU).reshape(-1, 9, 9) + _BY_VELOCITY) * dt
+    square = A @ A
+    # The mean of the exponential over the step, sum_k (A dt)^k / (k + 1)!: exact to 1e-13 for a turn of 0.03 rad, of a
+    # brisk flight sampled at 100 Hz, and to 2e-10 for 0.1 rad, over a gap.
+    mean = _IDENTITY + A / 2.0 + square / 6.0 + square @ A @ (_IDENTITY / 24.0 + A / 120.0 + square / 720.0)
+    return StepMatrices(_IDENTITY + A @ mean, mean[..., :6] * dt)
 
 
 def random_walks(config: PoseEkfConfig) -> FloatArray:
