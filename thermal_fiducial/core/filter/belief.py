@@ -62,9 +62,10 @@ class Hypothesis(NamedTuple):
     """An estimate with the numbers of poses that passed and failed its gate."""
 
     estimate: Estimate
-    #: instants of its first and of its last accepted pose, in the IMU's clock
+    #: instants of its first, of its last accepted, and of its last pose, in the IMU's clock
     started_ns: int
     accepted_ns: int
+    compared_ns: int
     hits: int = 1
     misses: int = 0
     #: number of latest poses accepted in a row, or refused in a row
@@ -82,6 +83,7 @@ class Hypothesis(NamedTuple):
         return self._replace(
             estimate=estimate,
             accepted_ns=estimate.stamp_ns,
+            compared_ns=estimate.stamp_ns,
             hits=self.hits + 1,
             accepted_in_row=self.accepted_in_row + 1,
             refused_in_row=0,
@@ -91,6 +93,7 @@ class Hypothesis(NamedTuple):
         """The hypothesis after a refused pose with its ``innovation`` (6,)."""
         return self._replace(
             estimate=estimate,
+            compared_ns=estimate.stamp_ns,
             misses=self.misses + 1,
             accepted_in_row=0,
             refused_in_row=self.refused_in_row + 1,

@@ -288,7 +288,7 @@ class History:
         if step_ns := self._camera_steps.get(pose.stamp_ns, 0):
             estimate = estimate.after_camera_step(step_ns / SECOND_NS)
         for begin_ns, std in self._clock_steps:
-            if hypothesis.accepted_ns <= begin_ns < estimate.stamp_ns:
+            if hypothesis.compared_ns <= begin_ns < estimate.stamp_ns:
                 estimate = estimate.after_clock_steps(self.imu.at(estimate.stamp_ns), std)
         motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)
         measured = body_pose(pose, estimate.state.T_body_camera, self.config.pose_noise_scale)
@@ -327,5 +327,5 @@ class History:
         kept = {pose.stamp_ns for pose in self._poses}
         self._camera_steps = {stamp: step for stamp, step in self._camera_steps.items() if stamp in kept}
         self._imu_steps = [step for step in self._imu_steps if step[0] >= self.imu.oldest_ns]
-        accepted_ns = min((h.accepted_ns for h in oldest.hypotheses), default=horizon_ns)
-        self._clock_steps = [step for step in self._clock_steps if step[0] >= accepted_ns]
+        compared_ns = min((h.compared_ns for h in oldest.hypotheses), default=horizon_ns)
+        self._clock_steps = [step for step in self._clock_steps if step[0] >= compared_ns]

@@ -96,7 +96,7 @@ def first_hypothesis(
     blank = replace(blank_state(config), time_offset=time_offset)
     measured = body_pose(pose, blank.T_body_camera, config.pose_noise_scale)
     estimate = start(config, measured, time_ns, blank, window)
-    return estimate if isinstance(estimate, Condition) else Hypothesis(estimate, time_ns, time_ns)
+    return estimate if isinstance(estimate, Condition) else Hypothesis(estimate, time_ns, time_ns, time_ns)
 
 
 def relinearises(begun: Hypothesis, first_offset: float) -> bool:
@@ -126,7 +126,8 @@ def alternative_to(
     if isinstance(begun, Condition):
         return None
     needed = min(main.hits, _ENOUGH_POSES) if _is_far(config, innovation) else 0
-    return Hypothesis(begun, estimate.stamp_ns, estimate.stamp_ns, needed=needed)
+    begun_ns = estimate.stamp_ns
+    return Hypothesis(begun, begun_ns, begun_ns, begun_ns, needed=needed)
 
 
 def _is_far(config: PoseEkfConfig, innovation: Innovation) -> bool:

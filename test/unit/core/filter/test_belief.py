@@ -25,7 +25,7 @@ def known_to(position_std, stamp_ns=0):
 
 
 def hypothesis(position_std=0.01, **changes):
-    return Hypothesis(known_to(position_std), 0, 0)._replace(**changes)
+    return Hypothesis(known_to(position_std), 0, 0, 0)._replace(**changes)
 
 
 def verdict(stamp_ns):
@@ -149,6 +149,6 @@ def test_an_alternative_that_half_of_the_poses_miss_is_dropped(main):
 
 def test_samples_are_needed_from_the_earlier_hypothesis_on():
     assert Belief(verdict=verdict(7)).stamp_ns == 7
-    early, late = hypothesis(), Hypothesis(known_to(0.01, FRAME_NS), 0, 0)
+    early, late = hypothesis(), Hypothesis(known_to(0.01, FRAME_NS), 0, 0, 0)
     assert Belief(main=late, alternative=early, verdict=verdict(2 * FRAME_NS)).stamp_ns == 0
     assert Belief(main=late, verdict=verdict(2 * FRAME_NS)).stamp_ns == FRAME_NS

@@ -11,6 +11,7 @@ from support.flights import config, errors, Flight, in_order, run_watched, START
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid
 from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.filter.state import POSITION
 from thermal_fiducial.core.geometry.se3 import so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 
@@ -299,6 +300,25 @@ def test_all_clocks_may_step_by_a_few_samples(step):
     assert squares_behind_step(flight, output).max() < chi2.ppf(0.9973, 6)
     # without pause, but for the two samples that confirm a jump
     assert sum(state.stamp_ns - START_NS >= AT * 1e9 for state in output) >= (5.0 - AT) * 200.0 - 2
+
+
+def test_refused_poses_are_no_further_evidence_that_the_clocks_have_stepped():
+    """A step may have been at a gap once, however many wrong poses come behind it: 30 made it five times as large."""
+    flight = Flight(seed=3, seconds=5.0)
+    gap_ns = [START_NS + round(1e9 * seconds) for seconds in (AT, AT + 0.12)]
+    samples = [sample for sample in flight.samples() if not gap_ns[0] < sample.stamp_ns < gap_ns[1]]
+    stds = []
+    for count in (1, 30):
+        ekf = PoseEkf(config())
+        before = [pose for pose in flight.poses if pose.stamp_ns < gap_ns[0]]
+        behind = [pose for pose in flight.poses if pose.stamp_ns > gap_ns[1]][:count]
+        far = transform(np.eye(3), [5.0, 0.0, 0.0])
+        wrong = [replace(pose, T_map_camera=far @ pose.T_map_camera) for pose in behind]
+        run_watched(ekf, timeline([s for s in samples if s.stamp_ns < gap_ns[1] + 1_100_000_000], before + wrong, LATE))
+        assert ekf.resets == 0
+        stds.append(ekf.estimate.std(POSITION))
+    # a refused pose teaches the noise of poses alone
+    assert stds[1] == pytest.approx(stds[0], rel=1e-3)
 
 
 @pytest.mark.parametrize('flown', [flown_by_a_stepping_imu, flown_by_stepping_clocks])
