@@ -30,6 +30,9 @@ from thermal_fiducial.errors import InputError
 _LEAST_POSES = 100
 # Significance (standard deviations from zero) above which a read-out time is reported.
 _SIGNIFICANT = 3.0
+# Re-projection error [px] of most frames beyond which the map is wrong: a read-out of 16 ms that is not known yet
+# bends an image by as much at 100 deg/s, most of which a pose takes up.
+_MISFIT_PX = 20.0
 # Corners are moved to the middle row's time and poses solved again until read-out time and jitter converge [s].
 _ROUNDS, _SETTLED = 8, 2e-5
 
@@ -110,11 +113,12 @@ def calibrate_rolling_camera_imu(
     Raises
     ------
     InputError
-        As there.
+        As there, or corners that are not where map and calibration have them.
     """
     recording = _RigRecording(imu, start_ns)
     at_once = _solved(frames, camera)
     at_once = list(compress(at_once, recording.covers([frame.pose for frame in at_once])))
+    _require_fit(at_once)
     solved, _, first = _rolling(recording, at_once, camera, noise)
     shaken = imu.noise(noise)
     _, problem, second = _rolling(recording, solved, camera, shaken, first.jitter, first.state)
@@ -165,6 +169,16 @@ def _solved(
         except InputError:
             continue
     return solved
+
+
+def _require_fit(frames: Sequence[SolvedFrame]) -> None:
+    """Raise InputError if the corners of most frames do not fit the map."""
+    apart_px = float(np.median([frame.pose.rms_px for frame in frames])) if frames else 0.0
+    if apart_px > _MISFIT_PX:
+        raise InputError(
+            f'corners are {apart_px:.0f} px from where the map has them, in the median of the frames: positions and '
+            'sides of the map in metres, its dictionary, the calibration?'
+        )
 
 
 def _row_shifts(frames: Sequence[FrameCorners], camera: Camera, problem: Problem, state: State) -> list[FloatArray]:

@@ -81,7 +81,8 @@ class FrameCorners:
         corners = self.corners_px if shift is None else self.corners_px + shift
         pose = solve_camera_pose(corners, self.covariances, self.points, camera, initial)
         moments = self._moments(camera, pose.T_map_camera, corners)
-        return SolvedFrame(self, CameraPose(self.stamp_ns, pose.T_map_camera, pose.covariance), moments)
+        fitted = CameraPose(self.stamp_ns, pose.T_map_camera, pose.covariance, rms_px=pose.rms_px)
+        return SolvedFrame(self, fitted, moments)
 
     def _moments(self, camera: Camera, T_map_camera: FloatArray, corners: FloatArray) -> RowMoments:
         count = len(corners)

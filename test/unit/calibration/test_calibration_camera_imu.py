@@ -273,6 +273,15 @@ def test_noiseless_rolling_recording_gives_the_readout_time_back():
     assert error[6] < 2e-6
 
 
+def test_a_map_that_is_not_the_one_in_view_is_named():
+    """In millimetres, say: the adjustment ended in a matrix without an inverse."""
+    frames, camera, imu = rolling_recording(SCENARIO, 13.0, 1, 0.0, sigma_px=0.1)
+    for frame in frames:
+        frame.T_map_marker[:, :3, 3] *= 1000.0
+    with pytest.raises(InputError, match='px from where the map has them'):
+        calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, IMU)
+
+
 @pytest.mark.parametrize('readout', [0.0, READOUT])
 def test_readout_time_and_extrinsics_within_their_errors(readout):
     frames, camera, imu = rolling_recording(SCENARIO, 15.0, 1, readout, sigma_px=0.1)
