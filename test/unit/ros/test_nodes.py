@@ -672,8 +672,10 @@ def test_a_camera_that_repeats_one_frame_is_reported_as_stalled(graph, capfd):
     for message in (first, *same):
         graph.send('thermal/image_raw', message)
         graph.diagnose(node)
-    (line,) = [line for line in capfd.readouterr().err.splitlines() if 'stalled' in line]
-    assert line.endswith('camera stalled: frozen')
+    graph.send('thermal/image_raw', *frames(10)[-2:])
+    graph.diagnose(node)
+    lines = [line.partition(': ')[2] for line in capfd.readouterr().err.splitlines() if 'stalled' in line]
+    assert lines == ['camera stalled: frozen', 'over: camera stalled: frozen']
 
 
 def test_a_lost_pose_is_not_published_unless_asked_for(graph):

@@ -3,6 +3,8 @@
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 
 import pytest
@@ -145,6 +147,22 @@ def test_the_process_has_no_real_time_priority():
     (process,) = multiprocessing.active_children()
     assert os.sched_getscheduler(process.pid) == os.SCHED_OTHER
     worker.close()
+
+
+def test_work_for_a_node_that_was_killed_ends_without_a_word():
+    """A mapper killed in flight left a traceback of twenty lines on the console."""
+    program = (
+        'import os, time; from support.tasks import work; from thermal_fiducial.ros.process.worker import Background\n'
+        'if __name__ == "__main__":\n'
+        '    worker = Background(work)\n'
+        '    while worker.take() is None and worker.busy: time.sleep(0.01)\n'
+        '    worker.start(0.3)\n'
+        '    time.sleep(0.1)\n'
+        '    os._exit(0)\n'
+    )
+    # It returns when the last process has closed its standard error.
+    ended = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True)
+    assert ended.stderr == ''
 
 
 def test_closing_does_not_wait_for_the_work(worker):

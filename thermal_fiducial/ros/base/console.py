@@ -16,15 +16,17 @@ class Console:
         self._events[kind] = line
 
     def say(self, headline: str, *, calm: bool) -> None:
-        """Print the queued events, and the ``headline`` if it has changed."""
+        """Print the queued events, and the ``headline`` if it has changed, also that there is none any more."""
         for line in self._events.values():
             self._logger.warning(line)
         self._events.clear()
         if headline == self._said:
             return
-        self._said = headline
+        before, self._said = self._said, headline
         # Separate calls: rclpy refuses another severity from the same line of code.
         if headline and calm:
             self._logger.info(headline)
         elif headline:
             self._logger.warning(headline)
+        else:
+            self._logger.info(f'over: {before}')

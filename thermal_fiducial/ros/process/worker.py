@@ -157,5 +157,8 @@ def _serve(function: Callable[[Task], Result], connection: Connection) -> None:
             outcome: Result | Exception = function(task)
         except Exception as error:  # sent to the node, whatever it is
             outcome = error
-        connection.send(outcome)
+        try:
+            connection.send(outcome)
+        except BrokenPipeError:  # The node was killed meanwhile.
+            return
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
