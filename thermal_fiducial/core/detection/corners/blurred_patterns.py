@@ -42,10 +42,14 @@ LARGEST_OF_LEVEL, LARGEST_OF_CURVES = np.full(3, 0.25), np.array([0.5, 0.25, 0.2
 BENDS = 3
 # Places among the linear terms of the gradients of the contrast, of its curves, and of what bends the gray scale.
 _GRADIENTS, _BOWL, _CURVES, _BENT = slice(1, 3), slice(10, 11), slice(10, 17), slice(17, 17 + BENDS)
-# Cumulative standard normal distribution, by a table.
-_FARTHEST = 6.0
-_Z = np.linspace(-_FARTHEST, _FARTHEST, 2401)
-_BELOW = np.array([0.5 * math.erfc(-z / math.sqrt(2.0)) for z in _Z.tolist()])
+# Cumulative standard normal distribution: where its table ends, and places of it in a standard deviation.
+_FARTHEST, _PLACES = 6, 200
+_BELOW = np.array(
+    [
+        0.5 * math.erfc(-place / _PLACES / math.sqrt(2.0))
+        for place in range(-_FARTHEST * _PLACES, _FARTHEST * _PLACES + 1)
+    ]
+)
 # Ages of an exponential response in four parts, up to 0.6 time constants, up to 1.4, up to 2.8, and older: what they
 # weigh, and mean and variance in time constants. Fitted with two parts, markers in 2 to 5 px of lag were 1.1 to 2.6
 # times as far off; with three they were as with four or 10 % farther, with five or more as with four.
@@ -272,48 +276,63 @@ def _gaussian(
     of_optics : (Q, 2, 2) derivative of ``spread`` by the variance of the optics
     """
     count, cells = white.shape[:2]
-    x, y = cell_weights(along, cells, spread)
-    orders, samples = x.shape[1:3]
+    x, y = cell_weights(along, cells, spread).swapaxes(1, 2)
     black, c = (white - 1.0).astype(np.float32), spread[:, :1, 1].astype(np.float32)
-    # All derivatives down and across by two products: numpy takes longer to call than to multiply.
-    drawn = y.reshape(count, -1, cells) @ black @ x.reshape(count, -1, cells).swapaxes(1, 2)
-    shown = drawn.reshape(count, orders, samples, orders, samples).transpose(1, 3, 0, 2, 4)
-    (value, by_x, by_xx), (by_y, by_xy, by_xxy), (by_yy, by_xyy, by_xxyy) = shown.reshape(orders, orders, count, -1)
-    shape = value + c * (by_xy + np.float32(0.5) * c * by_xxyy)
-    slopes = np.stack([by_x + c * by_xxy, by_y + c * by_xyy])
+    # All derivatives down and across, then what blur makes of them, in place: fresh memory takes as long as sums in it.
+    shown = ((y @ black)[:, None] @ x.swapaxes(2, 3)).reshape(3, 3, count, -1)
+    (value, by_x, by_xx), (by_y, by_xy, by_xxy), (by_yy, by_xyy, by_xxyy) = shown
+    by_xxyy *= np.float32(0.5) * c
+    by_xxyy += by_xy
+    for shape, curved in ((value, by_xxyy), (by_x, by_xxy), (by_y, by_xyy)):
+        curved *= c
+        shape += curved
     # Blur spreads a pattern as heat does: its derivative by a variance is half its curvature.
     xx, yy, xy = (blur[:, None] * of_optics.reshape(count, 4)[:, [0, 3, 1]]).T[..., None].astype(np.float32)
-    wider = xx * by_xx + yy * by_yy + np.float32(2.0) * xy * by_xy
+    for curved, by_blur in ((by_xx, xx), (by_yy, yy), (by_xy, np.float32(2.0) * xy)):
+        curved *= by_blur
+    by_xx += by_yy
+    by_xx += by_xy
     across, down = _between(np.array([-_SURFACE_ENDS, cells + _SURFACE_ENDS]), along, spread)
     surface = (down[:, :, None] * across[:, None]).reshape(count, -1)
-    return PatternModel(*map(grid.by_patches, (shape, slopes, wider, surface)))
+    return PatternModel(*map(grid.by_patches, (value, np.stack([by_x, by_y]), by_xx, surface)))
 
 
 def linear_terms(
     model: PatternModel, spread: FloatArray, grid: PatternGrid, cells: int, *, displayed: bool
-) -> list[Float32Array]:
-    """Linear terms, (Q, ., P) each: the pattern; where it is graded its gradients, surface's end, levels, and curves.
+) -> Float32Array:
+    """Room for all derivatives (Q, 9 + L, P) that has the L linear terms in it.
 
+    These are the pattern; where it is graded its gradients, surface's end, levels, and curves.
     The bowl of the surface shows through the white cells alone, what curves the level is before all cells. In a picture
     for a display the contrast has further curves, and there is what a polynomial of the counts adds between black and
     white.
     """
+    value, number = model.value, len(grid.curves) if displayed else 1
+    linear = 1 if not grid.graded else _BOWL.start + number + (BENDS if displayed else 0)
+    J = np.empty((len(value), LINEAR.start + linear, value.shape[1]), dtype=np.float32)
+    terms = J[:, LINEAR]
     if not grid.graded:
-        return [grid.without_background(model.value)[:, None]]
+        terms[:, 0] = grid.without_background(value)
+        return J
     # Of a blurred product with a linear function: the gradient of what is blurred moves with it.
     displaced = (spread / cells).astype(np.float32) @ model.slopes.swapaxes(0, 1)
-    graded = model.value[:, None] * grid.middle + displaced
-    number = len(grid.curves) if displayed else 1
-    (by_u, by_v), white = grid.curve_slopes[:, :number], (1.0 + model.value)[:, None]
-    curves = grid.curves[:number] * white + (by_u * displaced[:, :1] + by_v * displaced[:, 1:])
-    level = np.broadcast_to(grid.levels, (len(spread), *grid.levels.shape))
+    terms[:, 0] = value
+    graded, curves = terms[:, _GRADIENTS], terms[:, _BOWL.start : _BOWL.start + number]
+    # In place: fresh memory takes as long as what is computed in it.
+    np.multiply(value[:, None], grid.middle, out=graded)
+    graded += displaced
     # What lacks of the surface, not the surface: small numbers for sums in single precision.
-    terms = [model.value[:, None], graded, model.surface[:, None] - np.float32(1.0), level, curves]
+    np.subtract(model.surface, 1.0, out=terms[:, _GRADIENTS.stop])
+    terms[:, _GRADIENTS.stop + 1 : _BOWL.start] = grid.levels
+    np.multiply(grid.curves[:number], (1.0 + value)[:, None], out=curves)
+    for slopes, along in zip(grid.curve_slopes[:, :number], displaced.swapaxes(0, 1), strict=True):
+        curves += slopes * along[:, None]
     if displayed:
-        across = 2.0 * model.value + 1.0
-        bent = model.value * (1.0 + model.value)
-        terms += [part[:, None] for part in (bent, across * bent, across * across * bent)]
-    return terms
+        across, bent = 2.0 * value + 1.0, terms[:, _BENT]
+        np.multiply(value, 1.0 + value, out=bent[:, 0])
+        for before in range(BENDS - 1):
+            np.multiply(across, bent[:, before], out=bent[:, before + 1])
+    return J
 
 
 def local_contrast(amounts: Float32Array, model: PatternModel, grid: PatternGrid, *, displayed: bool) -> Float32Array:
@@ -332,7 +351,7 @@ def local_contrast(amounts: Float32Array, model: PatternModel, grid: PatternGrid
 
 def _between(ends: FloatArray, along: FloatArray, spread: FloatArray) -> Float32Array:
     """Share (2, Q, S) of a stretch between two ``ends`` (2,) at places ``along`` (... S), for a blur [cells^2]."""
-    below = np.interp((ends[:, None] - along[..., None, :]) / _widths(spread), _Z, _BELOW)
+    below = _normal((ends[:, None] - along[..., None, :]) / _widths(spread))[1]
     return np.asarray(below[..., 1, :] - below[..., 0, :], dtype=np.float32)
 
 
@@ -366,7 +385,17 @@ def cell_weights(along: FloatArray, cells: int, spread: FloatArray) -> Float32Ar
     spread : (Q, 2, 2) covariance of the blur [cells^2]
     """
     width = _widths(spread)
+    z, below, density = _normal((np.arange(cells + 1) - along[..., None]) / width)
+    density /= width
+    return np.diff(np.stack([below, -density, -z * density / width], axis=-3)).astype(np.float32)
+
+
+def _normal(z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Standard normal variables, not farther off than ``_FARTHEST``, their cumulative distribution and its density."""
     # So far off nothing is left, but no number in single precision is too small.
-    z = np.clip((np.arange(cells + 1) - along[..., None]) / width, -_FARTHEST, _FARTHEST)
-    density = np.exp(-0.5 * z * z) / (math.sqrt(2.0 * math.pi) * width)
-    return np.diff(np.stack([np.interp(z, _Z, _BELOW), -density, -z * density / width], axis=-3)).astype(np.float32)
+    z = np.clip(z, -_FARTHEST, _FARTHEST)
+    density = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
+    # From the nearest place of the table, to a millionth: numpy's interpolation takes many times as long.
+    places = np.rint(z * _PLACES)
+    nearest = _BELOW.take((places + _FARTHEST * _PLACES).astype(np.intp))
+    return z, nearest + (z - places / _PLACES) * density, density

@@ -15,6 +15,7 @@ import numpy as np
 from thermal_fiducial.core.detection.corners.blurred_patterns import (
     blurred,
     cells_by_pixels,
+    LINEAR,
     linear_terms,
     pattern_grid,
     PatternView,
@@ -64,7 +65,7 @@ class GrayScale(NamedTuple):
         grid, white = pattern_grid(decoder.cells, _DENSITY), decoder.patterns(ids, np.zeros_like(ids))
         to_cells = cells_by_pixels(corners_px, decoder.cells)
         model, spread = blurred(view, to_cells, np.full(len(ids), blur_px), white, grid)
-        terms = np.concatenate(linear_terms(model, spread, grid, decoder.cells, displayed=False), axis=1)
+        terms = linear_terms(model, spread, grid, decoder.cells, displayed=False)[:, LINEAR]
         places = view.places(corners_px, grid)
         known, gray = view.known(*places), view.values(*places)
         blank(terms, known)

@@ -295,8 +295,8 @@ def _variance_by_patches(at: PatternResiduals, inverse: FloatArray) -> FloatArra
     The squares of what the residuals of single patches move the corners by are added (K.-Y. Liang, S. Zeger,
     "Longitudinal data analysis using generalized linear models", 1986). ``inverse`` (Q, K, K): of the information.
     """
-    moves = (inverse[:, CORNERS].astype(np.float32) @ at.J) * at.weighted[:, None]
-    moved = at.grid.patches(moves).sum(axis=3)
+    by_patches = at.grid.patches(at.J).swapaxes(1, 2) @ at.grid.patches(at.weighted)[..., None]
+    moved = inverse[:, CORNERS] @ by_patches[..., 0].swapaxes(1, 2)
     # So much of what patches miss is left by a fit of so many parameters.
     left = 1.0 - (at.J.shape[1] - at.grid.background.shape[1]) / moved.shape[2]
     claimed = np.maximum(np.trace(inverse[:, CORNERS, CORNERS], axis1=1, axis2=2), TINY)
@@ -304,8 +304,11 @@ def _variance_by_patches(at: PatternResiduals, inverse: FloatArray) -> FloatArra
 
 
 def _gradient(at: PatternResiduals) -> FloatArray:
-    """Derivative (Q, K, 1) of half the sum of the squared residuals."""
-    return np.asarray(-(at.J @ at.weighted[..., None]), dtype=np.float64)
+    """Derivative (Q, K, 1) of half the sum of the squared residuals, which is least over all that is linear."""
+    gradient = np.zeros((*at.J.shape[:2], 1))
+    nonlinear = slice(LINEAR.start)
+    np.negative(at.J[:, nonlinear] @ at.weighted[..., None], out=gradient[:, nonlinear])
+    return gradient
 
 
 def _solvable(information: FloatArray) -> FloatArray:

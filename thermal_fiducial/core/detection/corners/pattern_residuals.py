@@ -5,6 +5,7 @@ more of it. In pictures for a display they may differ from linear ones around ea
 meet, by what the marker itself shows.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -133,7 +134,8 @@ class PatternResiduals(Stacked):
         view = view.only(which)
         samples = _samples(view.values(*view.places(quads, self.grid)), self.grid, self.known[which])
         uneven = self.unevenness and self.unevenness.only(which)
-        terms, products = self.J[which, LINEAR], self.information[which, LINEAR, LINEAR]
+        # Not copied: markers have millions of derivatives.
+        terms, products = [self.J[index, LINEAR] for index in which], self.information[which, LINEAR, LINEAR]
         self.corners_px[which], self.samples[which] = quads, samples
         self.amounts[which], self.rest[which], self.weighted[which] = fitted(terms, products, samples, uneven)
 
@@ -166,9 +168,8 @@ def linearised(
     places = view.places(quads, grid)
     known = view.known(*places)
     samples = _samples(view.values(*places), grid, known)
-    parts = linear_terms(model, spread, grid, white.shape[1], displayed=view.displayed)
-    J = np.empty((len(quads), LINEAR.start + sum(part.shape[1] for part in parts), samples.shape[1]), dtype=np.float32)
-    terms = np.concatenate(parts, axis=1, out=J[:, LINEAR])
+    J = linear_terms(model, spread, grid, white.shape[1], displayed=view.displayed)
+    nonlinear, terms = J[:, : LINEAR.start], J[:, LINEAR]
     blank(terms, known)
     products = products_of(terms)
     amounts, rest, weighted = fitted(terms, products, samples, None)
@@ -186,11 +187,11 @@ def linearised(
     np.multiply(by_px[:, :, None], grid.weights, out=J[:, CORNERS].reshape(len(quads), 2, 4, -1))
     np.multiply(contrast, model.wider, out=J[:, BLUR])
     if not grid.graded:
-        J[:, : LINEAR.start] = grid.without_background(J[:, : LINEAR.start])
-    blank(J[:, : LINEAR.start], known)
+        nonlinear[:] = grid.without_background(nonlinear)
+    blank(nonlinear, known)
     information = np.empty((len(J), J.shape[1], J.shape[1]))
     information[:, LINEAR, LINEAR] = products
-    information[:, : LINEAR.start] = J[:, : LINEAR.start] @ J.swapaxes(1, 2)
+    information[:, : LINEAR.start] = nonlinear @ J.swapaxes(1, 2)
     information[:, LINEAR, : LINEAR.start] = information[:, : LINEAR.start, LINEAR].swapaxes(1, 2)
     if uneven is not None:
         information -= uneven.information(J)
@@ -227,13 +228,14 @@ def _weighted(rest: Float32Array, uneven: Unevenness | None) -> Float32Array:
 
 
 def fitted(
-    terms: Float32Array, products: FloatArray, samples: Float32Array, uneven: Unevenness | None
+    terms: Iterable[Float32Array], products: FloatArray, samples: Float32Array, uneven: Unevenness | None
 ) -> tuple[FloatArray, Float32Array, Float32Array]:
     """Amounts (Q, L) of linear terms (Q, L, P) with ``products`` (Q, L, L) in gray levels (Q, P).
 
     And what they leave (Q, P) of these, as it is and weighted.
     """
-    shown = terms @ _weighted(samples, uneven)[..., None]
-    amounts = np.linalg.solve(products + TINY * np.eye(terms.shape[1]), shown)
-    rest = samples - (terms.swapaxes(1, 2) @ amounts.astype(np.float32))[..., 0]
-    return np.asarray(amounts[..., 0]), np.asarray(rest), _weighted(rest, uneven)
+    shown = np.array([rows @ row for rows, row in zip(terms, _weighted(samples, uneven), strict=True)])
+    amounts = np.linalg.solve(products + TINY * np.eye(products.shape[1]), shown[..., None])[..., 0]
+    modelled = [row @ rows for rows, row in zip(terms, amounts.astype(np.float32), strict=True)]
+    rest = samples - np.array(modelled)
+    return np.asarray(amounts), np.asarray(rest), _weighted(rest, uneven)
