@@ -6,12 +6,13 @@ maps onto itself, and v a pattern with v + R v in C. All words of v + C and all 
 of them differ in at least d bits. Of these the search keeps the cuttable ones, one of each four rotations.
 
 Such codes are grown a dimension at a time: R acts unipotently on the patterns (R^4 = 1 in characteristic 2), so
-every invariant code can be reached by adding, each time, a g with g + R g already in the code. The g of one step
-form a space of at most a few hundred cosets. All are tried, and one of the suitable ones is chosen at random.
+every invariant code can be reached by adding, each time, a g with g + R g already in the code. The g of one step form a
+space of at most 512 cosets at 6 x 6 bits, 65,536 at 8 x 8. All are tried, or a random part of them where they have more
+words than an attempt has time for, and one of the suitable ones is chosen at random.
 Background: F. MacWilliams, N. Sloane, "The Theory of Error-Correcting Codes", 1977.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,6 +22,10 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bit_patterns import cuttable, rotate, rotations, unpack, weight, Words
 from thermal_fiducial.fabrication.cuttability import examine
 
+# Most words of a code, whose cosets have a quarter as many markers; and most that are examined in a step, a second's.
+_MOST_WORDS, _MOST_EXAMINED = 1 << 18, 1 << 24
+# Words that are examined at a time: 8 MB, and as much a few times on the way.
+_WORDS_AT_A_TIME = 1 << 20
 # Markers that are compared with all at a time: 30,000 among themselves would take gigabytes.
 _AT_A_TIME = 256
 
@@ -78,31 +83,45 @@ def span(generators: Iterable[int]) -> Words:
 
 
 def random_code(n: int, distance: int, rng: np.random.Generator) -> LinearCode:
-    """A random code that cannot be extended by a further dimension.
+    """A random code that cannot be extended by a further dimension, as far as is tried, or is large enough.
 
     Every other one prefers generators that keep all weights divisible by 4: such codes (Golay's is one) are dense
     at distances divisible by 4.
     """
     code = LinearCode(n)
     doubly_even = bool(rng.integers(2))
-    cosets = code.invariant_cosets()[1:]
-    while True:
-        weights = weight(code.words ^ cosets[:, None])
-        fit = cosets[weights.min(axis=1) >= distance]
-        if not len(fit):
-            return code
-        preferred = cosets[(weights.min(axis=1) >= distance) & np.all(weights % 4 == 0, axis=1)]
-        choices = preferred if doubly_even and len(preferred) else fit
-        code.add(int(choices[rng.integers(len(choices))]))
-        cosets = code.invariant_cosets()[1:]
+    while len(code.words) < _MOST_WORDS:
+        fit, doubly = [np.zeros(0, np.uint64)], [np.zeros(0, np.uint64)]
+        for cosets in _some(code, code.invariant_cosets()[1:], rng):
+            weights = weight(code.words ^ cosets[:, None])
+            apart = weights.min(axis=1) >= distance
+            fit.append(cosets[apart])
+            doubly.append(cosets[apart & np.all(weights % 4 == 0, axis=1)])
+        preferred = np.concatenate(doubly if doubly_even and any(map(len, doubly)) else fit)
+        if not len(preferred):
+            break
+        code.add(int(preferred[rng.integers(len(preferred))]))
+    return code
 
 
-def best_coset(code: LinearCode, distance: int) -> Words:
+def _some(code: LinearCode, cosets: Words, rng: np.random.Generator) -> Iterator[Words]:
+    """``cosets`` of a code, a block at a time; a random part of them where all have too many words."""
+    most = max(1, _MOST_EXAMINED // len(code.words))
+    if len(cosets) > most:
+        cosets = np.sort(rng.choice(cosets, most, replace=False))
+    step = max(1, _WORDS_AT_A_TIME // len(code.words))
+    for first in range(0, len(cosets), step):
+        yield cosets[first : first + step]
+
+
+def best_coset(code: LinearCode, distance: int, rng: np.random.Generator) -> Words:
     """The markers of the coset of ``code`` that has most, one word of each four rotations."""
-    cosets = code.invariant_cosets()
-    words = code.words ^ cosets[:, None]
-    fit = cuttable(words.reshape(-1), code.n).reshape(words.shape)
-    most = words[np.argmax(np.sum(fit, axis=1))]
+    best, most = -1, np.zeros(0, np.uint64)
+    for cosets in _some(code, code.invariant_cosets(), rng):
+        words = code.words ^ cosets[:, None]
+        counts = np.sum(cuttable(words.reshape(-1), code.n).reshape(words.shape), axis=1)
+        if (found := int(counts.max())) > best:
+            best, most = found, words[np.argmax(counts)]
     turned = rotations(most[cuttable(most, code.n)], code.n)
     own = np.min(weight(turned[1:] ^ turned[0]), axis=0)
     return np.unique(turned.min(axis=0)[own >= distance])
@@ -114,9 +133,12 @@ def apart_from_negatives(markers: Words, n: int, distance: int) -> Words:
     Markers with the fewest negatives too close to them are taken first.
     """
     full = np.uint64((1 << n * n) - 1)
-    turned = rotations(markers, n)
-    bits_apart = np.min(weight(turned[:, :, None] ^ full ^ markers[None, None]), axis=0)
-    close = bits_apart < distance
+    negatives_of = rotations(markers, n) ^ full
+    close = np.zeros((len(markers), len(markers)), dtype=bool)
+    for turned in negatives_of:
+        for first in range(0, len(markers), _AT_A_TIME):
+            block = slice(first, first + _AT_A_TIME)
+            close[block] |= weight(turned[block, None] ^ markers) < distance
     kept: list[int] = []
     for index in np.argsort(close.sum(axis=1), kind='stable').tolist():
         if not close[index, index] and not np.any(close[index, kept]):
@@ -157,7 +179,7 @@ def search(
     rng = np.random.default_rng(seed)
     best = np.zeros(0, np.uint64)
     for done in range(1, restarts + 1):
-        markers = best_coset(random_code(n, distance, rng), distance)
+        markers = best_coset(random_code(n, distance, rng), distance, rng)
         markers = apart_from_negatives(markers, n, distance) if signed else markers
         best = markers if len(markers) > len(best) else best
         if progress is not None:

@@ -11,7 +11,13 @@ from thermal_fiducial.cli.main import main
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bit_patterns import cuttable, pack, rotate, unpack, weight
 from thermal_fiducial.fabrication.cuttability import examine
-from thermal_fiducial.fabrication.dictionary_search import distances, negatives, random_code, search
+from thermal_fiducial.fabrication.dictionary_search import (
+    apart_from_negatives,
+    distances,
+    negatives,
+    random_code,
+    search,
+)
 from thermal_fiducial.files.dictionary import load_dictionary, packaged
 from thermal_fiducial.files.dictionary import PACKAGED as FOLDER
 
@@ -165,6 +171,26 @@ def test_distances_of_many_markers_take_little_memory():
     tracemalloc.stop()
     # A block of 256 x 3000 numbers is 3 MB, of which some are made on the way; all pairs bit by bit were 324 MB.
     assert most < 30e6
+
+
+def _most_memory(work):
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_search_takes_little_memory():
+    """Eight blocks of a million words; all cosets at a time were 0.4 GB here, and ever more at less distance."""
+    assert _most_memory(lambda: search(7, 14, seed=1, restarts=1)) < 80e6
+
+
+def test_negatives_of_many_markers_take_little_memory():
+    """One byte a pair, 2 MB, and some blocks of 256 x 1500 words of 3 MB; four numbers a pair were 0.2 GB."""
+    markers = np.unique(np.random.default_rng(1).integers(0, 1 << 36, 1500, dtype=np.uint64))
+    assert _most_memory(lambda: apart_from_negatives(markers, 6, 12)) < 30e6
 
 
 @pytest.mark.parametrize(('bits', 'distance'), [(2, 4), (9, 4), (4, 0), (4, 17), (3, 9)])
