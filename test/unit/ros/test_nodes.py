@@ -243,6 +243,16 @@ def test_an_image_of_another_size_than_the_calibration_is_refused(graph):
     assert graph.diagnose(node)[:2] == (WARN, 'image of 320x256, camera_info of 640x512 pixels')
 
 
+def test_a_calibration_of_another_resolution_is_doubted(graph):
+    node = graph.add(ArucoDetector, marker_size=small_bag.SIZE)
+    K = small_bag.CAMERA.K * [[0.5], [0.5], [1.0]]
+    graph.send('thermal/camera_info', info(replace(small_bag.CAMERA, K=K)))
+    graph.send('thermal/image', frames(1)[0])
+    level, words, _ = graph.diagnose(node)
+    assert level == WARN
+    assert 'principal point (160, 128) in images of 640x512 pixels: is the calibration of another resolution?' in words
+
+
 def test_parameters_that_do_nothing_are_warned_of_while_the_detector_works(graph):
     node = graph.add(ArucoDetector, whitelist=[3, 77])
     dynamic = [Parameter('guided', value=False), Parameter('guided_min_margin', value=0.1)]

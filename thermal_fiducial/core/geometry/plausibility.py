@@ -26,6 +26,9 @@ _NO_VARIANCE = 1e-15
 #: Focal length and distance of the principal point from the image, in longer sides of the image.
 _FOCAL_RANGE, _FARTHEST_CENTRE = (0.02, 1000.0), 1.0
 _IMAGE_SIDES = (8, 16384)
+#: Distance of the principal point from the middle of the image, as a share of its sides, beyond which the calibration
+#: is doubted: half a resolution makes it 0.25; of six published calibrations of other cameras the largest is 0.07.
+_DOUBTFUL_CENTRE = 0.2
 #: How far a rotation matrix times its transpose may be off the identity: one that was written down with four digits.
 _ORTHONORMAL = 1e-3
 #: Error [px] to which a distortion must be invertible half-way from the centre to the corners.
@@ -97,6 +100,16 @@ def require_usable(camera: 'Camera') -> 'Camera':
             raise InputError(f'camera matrix with {name} {centre:.6g} for an image of {camera.width}x{camera.height}')
     _require_invertible(camera)
     return camera
+
+
+def doubt_of_resolution(camera: 'Camera') -> str:
+    """Warning if the principal point is far from the middle of the image; else empty."""
+    size = np.array([camera.width, camera.height])
+    if np.abs(camera.principal_point / size - 0.5).max() < _DOUBTFUL_CENTRE:
+        return ''
+    u, v = camera.principal_point
+    centre = f'principal point ({u:.0f}, {v:.0f}) in images of {camera.width}x{camera.height} pixels'
+    return f'camera_info: {centre}: is the calibration of another resolution?'
 
 
 def _require_invertible(camera: 'Camera') -> None:

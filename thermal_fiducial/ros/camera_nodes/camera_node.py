@@ -8,6 +8,7 @@ from sensor_msgs.msg import CameraInfo, TimeReference
 
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.plausibility import doubt_of_resolution
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.errors import InputError
@@ -80,6 +81,7 @@ class CameraStageNode(StageNode[Config]):
         if self._camera is not None and camera.matches(self._camera):
             return
         self._camera = camera
+        self.remark(filter(None, [doubt_of_resolution(camera)]))
         self._calibrations += 1
         if self._calibrations > 1:
             self.get_logger().warning('camera_info has changed: the new calibration is used from here on')

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.plausibility import checked_covariance, require_image, require_usable
+from thermal_fiducial.core.geometry.plausibility import (
+    checked_covariance,
+    doubt_of_resolution,
+    require_image,
+    require_usable,
+)
 from thermal_fiducial.errors import InputError
 
 K = np.array([[530.0, 0.0, 319.5], [0.0, 530.0, 255.5], [0.0, 0.0, 1.0]])
@@ -87,6 +92,13 @@ def test_a_camera_of_a_real_lens_is_returned():
 def test_a_camera_that_no_lens_makes_is_refused(size, place, value, words):
     with pytest.raises(InputError, match=words):
         require_usable(Camera(*size, with_entry(K, place, value)))
+
+
+def test_a_calibration_of_half_or_twice_the_resolution_is_doubted():
+    assert doubt_of_resolution(Camera(640, 512, K)) == ''
+    for factor in (0.5, 2.0):
+        scaled = K * np.array([[factor], [factor], [1.0]])
+        assert 'of another resolution?' in doubt_of_resolution(Camera(640, 512, scaled))
 
 
 def test_a_distortion_that_folds_the_image_is_refused():
