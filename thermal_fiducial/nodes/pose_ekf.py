@@ -87,7 +87,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
 
     def figures(self) -> dict[str, object]:
         """Key-value pairs of the filter for the diagnostics."""
-        return self._status.figures()
+        return self._status.figures() | self._outputs.figures()
 
 
 def main() -> int:

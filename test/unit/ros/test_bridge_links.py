@@ -10,6 +10,7 @@ from nav_msgs.msg import Odometry
 import pytest
 from support.ros_graph import ros_graph
 
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.nodes.landing_target import LandingTarget
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.report.bridge_check import Level
@@ -61,6 +62,27 @@ def test_of_two_robots_that_of_the_namespace_is_listened_to():
             bridge_listener.listen(0.1, print, print, print, announce=topics.append, ros_arguments=arguments)
     assert [said.sender for said in topics] == ['/drone1/pose_ekf', '/drone2/pose_ekf']
     assert [said.landing for said in topics] == ['/drone1/landing_target', '/drone2/landing_target']
+
+
+def test_of_several_robots_one_must_be_named():
+    """It verified the first one that it found, without a word."""
+    with ros_graph() as graph:
+        for name in ('drone1', 'drone2'):
+            graph.added(PoseEkfNode(live=False, context=graph.context, namespace=name))
+        with pytest.raises(InputError, match='several robots, /drone1, /drone2: name one'):
+            bridge_listener.listen(0.1, print, print, print)
+
+
+@pytest.mark.parametrize(('bridge_rate', 'topic'), [(30.0, '/mavros/odometry/out'), (0.0, '/a/odom')])
+def test_a_remapped_odometry_is_not_taken_for_that_of_the_autopilot(bridge_rate, topic):
+    """Whatever name came first in the alphabet was listened to."""
+    with ros_graph(*MAVROS, '-r', 'odometry:=a/odom') as graph:
+        graph.add(PoseEkfNode, live=True, bridge_rate=bridge_rate)
+        topics = []
+        with ThreadPoolExecutor(1) as pool:
+            done = pool.submit(bridge_listener.listen, 0.1, print, print, print, announce=topics.append)
+            graph.spin_until(done.done)
+        assert [said.odometry for said in topics] == [topic]
 
 
 def test_two_publishers_and_a_missing_subscriber_are_reported():

@@ -1,4 +1,4 @@
-"""A node that gets messages faster than it can process them."""
+"""A node that gets messages faster than it can process them, and one that is not alone."""
 
 from itertools import pairwise
 import time
@@ -7,8 +7,9 @@ import pytest
 from sensor_msgs.msg import CameraInfo
 
 from thermal_fiducial.config import LandingTargetConfig
+from thermal_fiducial.nodes.landing_target import LandingTarget
 from thermal_fiducial.ros.base import qos
-from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.base.node import ERROR, StageNode
 
 pytestmark = pytest.mark.ros
 
@@ -28,6 +29,28 @@ class Overloaded(StageNode):
         self.more.send(CameraInfo())
         self.more.send(CameraInfo())
         time.sleep(0.01)
+
+
+def test_a_second_node_of_the_same_name_is_reported(graph, capfd):
+    """A launch file that was started twice gave two nodes of each, whose poses an autopilot got in turns."""
+    first = graph.add(LandingTarget, live=True, landing_pad=[7])
+    graph.diagnose(first)
+    second = graph.add(LandingTarget, live=True, landing_pad=[7])
+    words = 'a second node is named /landing_target: was the launch file started twice?'
+    graph.spin_until(lambda: first.get_node_names_and_namespaces().count(('landing_target', '/')) == 2)
+    # Not before DDS has forgotten one that was killed, after 20 s: it is just so at a restart in flight.
+    for _ in range(20):
+        first.diagnose(0)
+    assert words not in capfd.readouterr().err
+    for _ in range(10):
+        first.diagnose(0)
+    assert words in capfd.readouterr().err
+    heard = graph.heard['/diagnostics']
+    graph.spin_until(lambda: any((s.level, s.message) == (ERROR, words) for array in heard for s in array.status))
+    graph.nodes.remove(second)
+    second.destroy_node()
+    graph.spin_until(lambda: first.get_node_names_and_namespaces().count(('landing_target', '/')) == 1)
+    assert words not in graph.diagnose(first)[1]
 
 
 def test_timers_have_their_turn_in_an_overload(graph):

@@ -139,7 +139,8 @@ def test_other_robots_do_not_count():
     status = LiveStatus('/drone1')
     status.diagnostic(0.0, 'drone2/pose_ekf', 0, 'tracking', {})
     status.diagnostic(0.0, 'pose_ekf', 0, 'tracking', {})
-    assert status.snapshot(0.1).reasons == ('nothing is heard of pose_ekf',)
+    elsewhere = 'nothing is heard of pose_ekf, but in /drone2: --ros-args -r __ns:=/drone2'
+    assert status.snapshot(0.1).reasons == (elsewhere,)
     status.diagnostic(0.0, 'drone1/pose_ekf', 1, 'waiting for IMU', {})
     assert status.snapshot(0.1).reasons == ('waiting for IMU',)
 

@@ -38,6 +38,8 @@ _RATES = ('image_rate', 'imu_rate')
 _LONGEST_REASON = 400
 #: Diagnostics, one a second, after which the console repeats why messages are refused if it is still the same.
 _REPEATED_AFTER = 30
+#: Diagnostics after which a second node of the same name counts as alive: DDS takes 20 s to forget one that was killed.
+_TWIN_AFTER = 30
 
 
 class StageNode(CountingNode, Generic[Config]):
@@ -93,6 +95,8 @@ class StageNode(CountingNode, Generic[Config]):
         self._rates = InputRates(self.inputs, _expected_rate(self.config))
         #: why the node cannot go on in this process; see ``run``
         self.deaf = ''
+        # Diagnostics in a row for which there has been a second node of this name.
+        self._twin_for = 0
         #: console lines for a pilot
         self.console = Console(self.get_logger())
         #: warnings of the configuration, besides parameters that others keep from having an effect
@@ -218,8 +222,9 @@ class StageNode(CountingNode, Generic[Config]):
         self._rates.look(stamp_ns if not self.live or self._on_sim_time else time.monotonic_ns())
         if self.live and not self.deaf:
             self._listen()
+            self._look_for_twin()
         level, reason = self._level()
-        self.console.say(self._rates.trouble() or self.headline(), calm=level == OK)
+        self.console.say(self._twin or self._rates.trouble() or self.headline(), calm=level == OK)
         counts: dict[str, object] = {f'received {source.topic}': source.count for source in self.inputs}
         counts |= {f'left {source.topic}': source.left for source in self.inputs if source.left}
         counts |= {
@@ -243,10 +248,22 @@ class StageNode(CountingNode, Generic[Config]):
             self.deaf = f'deaf: port {", ".join(ports)} of the shared memory has been replaced'
             self.get_logger().error(f'{self.deaf}; the node starts again')
 
+    def _look_for_twin(self) -> None:
+        """Count for how long another node has had this one's name, as when a launch file was started twice."""
+        same = self.get_node_names_and_namespaces().count((self.get_name(), self.get_namespace()))
+        self._twin_for = self._twin_for + 1 if same > 1 else 0
+
+    @property
+    def _twin(self) -> str:
+        """That a second node of this name publishes the same topics; empty if it is alone."""
+        if self._twin_for < _TWIN_AFTER:
+            return ''
+        return f'a second node is named {self.get_fully_qualified_name()}: was the launch file started twice?'
+
     def _level(self) -> tuple[bytes, str]:
         """Level and message by precedence: deafness, faults, refused messages, missing main input, stage and rates."""
-        if self.deaf or self.faults:
-            return ERROR, '; '.join(filter(None, (self.deaf, *self.faults)))
+        if faults := [*filter(None, (self.deaf, self._twin)), *self.faults]:
+            return ERROR, '; '.join(faults)
         if self.refused > self._diagnosed_refused:
             return WARN, self.last_refusal
         if self._rates.silent:

@@ -38,10 +38,13 @@ class FlightControllerBridge:
     def __init__(self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None]) -> None:
         self._period_ns = round(SECOND_NS / config.bridge_rate) if config.bridge_rate > 0.0 else 0
         self._due_ns = 0
+        #: resolved name of the topic of its odometry; empty without one
+        self.topic = ''
         self._px4: Any = None
         if not self._period_ns:
             return
         self._odometry = node.advertise(OdometryMessage, 'bridge/odometry')
+        self.topic = self._odometry.topic
         self._pose = node.advertise(PoseWithCovarianceStamped, 'bridge/pose')
         if config.px4:
             try:

@@ -83,6 +83,10 @@ class FilterOutputs:
             self._bridge.send(smooth or odometry, self._state, jumps)
         self._path.add(odometry.stamp_ns, odometry.T_map_body)
 
+    def figures(self) -> dict[str, object]:
+        """Key-value pairs for the diagnostics: topics that may be remapped, which the graph does not show."""
+        return {convert.ODOMETRY_TOPIC: self._odometry.topic, convert.BRIDGE_TOPIC: self._bridge.topic}
+
     def send_clock(self, camera_stamp_ns: int, offset: float | None) -> None:
         """Publish the camera's clock offset [s] at the stamp of a frame, if it is known."""
         if offset is not None:

@@ -36,6 +36,8 @@ from thermal_fiducial.files.records import stamp_ns as stamp_ns
 if TYPE_CHECKING:
     from thermal_fiducial.core.geometry.camera import Camera
 
+#: Keys of the filter's diagnostics: topics of its odometry, and of that for a flight controller (empty without one).
+ODOMETRY_TOPIC, BRIDGE_TOPIC = 'odometry on', 'flight controller on'
 #: Largest deviation of a quaternion's norm from 1.
 NORM_TOLERANCE = 0.1
 # --- stamps, headers, poses ---------------------------------------------------------------------------

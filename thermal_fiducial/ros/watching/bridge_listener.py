@@ -15,6 +15,7 @@ from sensor_msgs.msg import Imu
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.messages.convert import BRIDGE_TOPIC, ODOMETRY_TOPIC
 from thermal_fiducial.ros.watching.observer import observer
 
 _FILTER, _LANDING = 'pose_ekf', 'landing_target'
@@ -23,8 +24,8 @@ _ODOMETRY, _IMU, _POSE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'geomet
 PX4_KIND = 'px4_msgs/msg/VehicleOdometry'
 #: Odometry topics of the filter that are not for a flight controller.
 _NOT_FOR_IT = ('odometry', 'odometry_smooth')
-#: Timeout of the search for a filter [s].
-DISCOVERY_S = 5.0
+#: Timeout of the search for a filter, and time for which its diagnostics are awaited, one a second [s].
+DISCOVERY_S, SAID_S = 5.0, 1.5
 
 
 @dataclass(frozen=True)
@@ -74,20 +75,20 @@ def listen(
     Raises
     ------
     InputError
-        No topic can have that name.
+        No topic can have that name, or there are several robots.
     """
     if topic:
         _require_name(topic)
     with observer('check_bridge', ros_arguments, domain_id) as (node, executor):
-        topics = Topics(*map(node.resolve_topic_name, astuple(_find(node, executor, topic))))
+        said: dict[str, DiagnosticStatus] = {}
+        node.create_subscription(DiagnosticArray, '/diagnostics', lambda array: _note(array, said), qos.RESULT)
+        topics = Topics(*map(node.resolve_topic_name, astuple(_find(node, executor, topic, said))))
         announce(topics)
         node.create_subscription(
             Odometry, topics.odometry, lambda message: on_odometry(message, time.time_ns()), qos.IMU_INPUT
         )
         node.create_subscription(Imu, topics.imu, on_imu, qos.IMU_INPUT)
         node.create_subscription(PoseStamped, topics.landing, on_landing_target, qos.RESULT)
-        said: dict[str, DiagnosticStatus] = {}
-        node.create_subscription(DiagnosticArray, '/diagnostics', lambda array: _note(array, said), qos.RESULT)
         _spin(executor, seconds, lambda: False)
         return _links(node, topics, said)
 
@@ -99,23 +100,45 @@ def _require_name(topic: str) -> None:
         raise InputError(f'--topic {topic!r} is not the name of a topic') from None
 
 
-def _find(node: Node, executor: Any, topic: str) -> Topics:
-    """Topics of the filter in the graph; the default names if there is none."""
-    found: list[Topics] = []
+def _find(node: Node, executor: Any, topic: str, said: dict[str, DiagnosticStatus]) -> Topics:
+    """Topics of the filter in the graph; the default names if there is none.
+
+    Parameters
+    ----------
+    said : node to its latest diagnostic, filled while the executor spins
+    """
+    found: dict[str, Topics] = {}
 
     def look() -> bool:
-        every = (_topics_of_filter(node, namespace) for namespace in _namespaces(node, _FILTER))
-        found.extend(topics for topics in every if topics is not None)
+        every = {space: _topics_of_filter(node, space, said) for space in _namespaces(node, _FILTER)}
+        found.update({space: topics for space, topics in every.items() if topics is not None})
         return bool(found)
 
     _spin(executor, DISCOVERY_S, look)
+    # A second robot may be discovered later, and the filter says once a second what it publishes where.
+    _spin(executor, SAID_S, lambda: False)
+    look()
     ours = 'bridge/odometry'
-    topics = found[0] if found else Topics(ours, 'imu/data', _LANDING, ours, _FILTER)
+    topics = _only(found, node.get_namespace()) or Topics(ours, 'imu/data', _LANDING, ours, _FILTER)
     topics = replace(topics, landing=_landing_topic(node) or topics.landing)
     return replace(topics, odometry=topic, autopilot=topic) if topic else topics
 
 
-def _topics_of_filter(node: Node, namespace: str) -> Topics | None:
+def _only(found: dict[str, Topics], own: str) -> Topics | None:
+    """Topics of the robot in the namespace ``own``, or else of the only one below it; None if there is none.
+
+    Raises
+    ------
+    InputError
+        There are several.
+    """
+    if own in found or len(found) < 2:
+        return found.get(own) or next(iter(found.values()), None)
+    spaces = sorted(found)
+    raise InputError(f'there are several robots, {", ".join(spaces)}: name one, as --ros-args -r __ns:={spaces[0]}')
+
+
+def _topics_of_filter(node: Node, namespace: str, said: dict[str, DiagnosticStatus]) -> Topics | None:
     published = node.get_publisher_names_and_types_by_node(_FILTER, namespace)
     subscribed = node.get_subscriber_names_and_types_by_node(_FILTER, namespace)
     odometry = sorted(name for name, kinds in published if _ODOMETRY in kinds)
@@ -124,7 +147,10 @@ def _topics_of_filter(node: Node, namespace: str) -> Topics | None:
         return None
     base = namespace.rstrip('/')
     bridge = [name for name in odometry if name not in {f'{base}/{own}' for own in _NOT_FOR_IT}]
-    sent = (bridge or odometry)[0]
+    status = said.get(f'{base}/{_FILTER}'.lstrip('/'), DiagnosticStatus())
+    named = {item.key: item.value for item in status.values}
+    # Remapped topics are known by the filter's own words only.
+    sent = named.get(BRIDGE_TOPIC) or named.get(ODOMETRY_TOPIC) or (bridge or odometry)[0]
     px4 = [name for name, kinds in published if PX4_KIND in kinds]
     return Topics(sent, imu[0], f'{base}/{_LANDING}', (px4 or [sent])[0], f'{base}/{_FILTER}')
 

@@ -122,6 +122,8 @@ class LiveStatus:
         self._markers: tuple[int, ...] = ()
         self._sigma: tuple[float, float] | None = None
         self._nodes: dict[str, _Node] = {}
+        #: namespaces, but for the root, in which a filter runs
+        self._elsewhere: set[str] = set()
         self._refusals: deque[tuple[float, str]] = deque(maxlen=MOST_REFUSALS)
 
     def odometry(self, now: float, age: float, sigma_m: float, sigma_deg: float) -> None:
@@ -140,6 +142,8 @@ class LiveStatus:
 
     def diagnostic(self, now: float, name: str, level: int, message: str, figures: Mapping[str, str]) -> None:
         """A diagnostic status of a node arrived."""
+        if name.endswith(f'/{_FILTER}'):
+            self._elsewhere.add(f'/{name.removesuffix(f"/{_FILTER}")}')
         if not name.startswith(self._prefix):
             return
         node = name.removeprefix(self._prefix)
@@ -181,7 +185,9 @@ class LiveStatus:
         filter_ = self._nodes.get(_FILTER)
         if not self._odometry.arrivals:
             if filter_ is None:
-                return ['nothing is heard of pose_ekf']
+                others = ', '.join(sorted(self._elsewhere))
+                hint = f', but in {others}: --ros-args -r __ns:={min(self._elsewhere)}' if others else ''
+                return [f'nothing is heard of pose_ekf{hint}']
             known = filter_.figures.get('lost') == 'False'
             return [f'no odometry is heard, but pose_ekf says: {filter_.message}' if known else filter_.message]
         reasons = []
