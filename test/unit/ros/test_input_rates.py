@@ -92,3 +92,15 @@ def test_a_simulated_clock_that_begins_late_is_no_low_rate():
         rates.look(0 if sample < 3 else 1_700_000_000 * SECOND + sample * SECOND // 2)
         assert rates.doubt() == ''
     assert rates.figures()['rate /main [Hz]'] == '30'
+
+
+def test_what_comes_while_the_clock_stands_still_is_no_high_rate():
+    """A simulated clock that stopped for 6 s while its sensors went on: 30 Hz were said to be 110."""
+    source = Input('/main')
+    rates = InputRates([source], expected=30.0)
+    times = [*range(12), *[11] * 6, *range(12, 26)]
+    for time_s in times:
+        source.count += 30
+        rates.look((100 + time_s) * SECOND)
+        assert rates.doubt() == ''
+    assert rates.figures()['rate /main [Hz]'] == '30'

@@ -33,10 +33,10 @@ class _Watch:
         self._first_rates: list[float] = []
 
     def look(self, time_ns: int) -> None:
-        """Sample the count at a time; while the clock is paused the rate is not updated.
+        """Sample the count at a time.
 
-        A simulated clock is 0 until its first message: the jump from there says nothing of a rate, nor does the time
-        for which an input had stopped.
+        A simulated clock is 0 until its first message: the jump from there says nothing of a rate, nor does what comes
+        while it stands still, nor the time for which an input had stopped.
         """
         count = self.source.count
         before_ns, before = self._looks[-1] if self._looks else (time_ns - SECOND_NS, 0)
@@ -44,7 +44,7 @@ class _Watch:
         self.silent = 0 if came else self.silent + 1
         if not self.is_steady:
             self._steady = self._steady + 1 if came else 0
-        if time_ns < before_ns or before_ns == 0 or returned:
+        if time_ns <= before_ns or before_ns == 0 or returned:
             self._looks.clear()
         elif time_ns > before_ns and came and len(self._first_rates) < _STEADY:
             self._first_rates.append((count - before) / (time_ns - before_ns) * SECOND_NS)
