@@ -89,10 +89,19 @@ def test_silence_is_no_pose():
     assert (snapshot.advice, snapshot.reasons) == (Advice.STOP, ('no odometry for 1.0 s',))
     waiting = LiveStatus()
     waiting.diagnostic(0.0, 'pose_ekf', 1, 'waiting for markers', {})
-    assert waiting.snapshot(0.5).reasons == ('waiting for markers',)
+    assert waiting.snapshot(0.5).reasons[0] == 'waiting for markers'
     unheard = LiveStatus()
     unheard.diagnostic(0.0, 'pose_ekf', 0, 'tracking', {'lost': 'False'})
-    assert unheard.snapshot(0.5).reasons == ('no odometry is heard, but pose_ekf says: tracking',)
+    assert unheard.snapshot(0.5).reasons[0] == 'no odometry is heard, but pose_ekf says: tracking'
+
+
+def test_what_keeps_the_pose_away_is_named_beside_it():
+    """It said that the pose is lost, but not that the camera was unplugged."""
+    said = {'pose_ekf': (2, 'lost: position known to 0.41 m'), 'tau2_camera': (2, 'nothing on thermal/image_raw')}
+    assert flying(**said).snapshot(4.0).reasons == (
+        'lost: position known to 0.41 m',
+        'tau2_camera: nothing on thermal/image_raw',
+    )
 
 
 def test_stamps_of_another_clock_give_no_latency():
@@ -142,7 +151,7 @@ def test_other_robots_do_not_count():
     elsewhere = 'nothing is heard of pose_ekf, but in /drone2: --ros-args -r __ns:=/drone2'
     assert status.snapshot(0.1).reasons == (elsewhere,)
     status.diagnostic(0.0, 'drone1/pose_ekf', 1, 'waiting for IMU', {})
-    assert status.snapshot(0.1).reasons == ('waiting for IMU',)
+    assert status.snapshot(0.1).reasons[0] == 'waiting for IMU'
 
 
 def test_the_screen_shows_all_that_the_line_shows():

@@ -170,11 +170,12 @@ class LiveStatus:
 
     def snapshot(self, now: float) -> LiveState:
         """The state at a time."""
-        stops, cares = self._stops(now), self._cares(now)
+        # Cares, too, with stops: a pose is lost, say, because the camera has stopped.
+        stops, cares = self._stops(now), self._cares(now) if self._nodes else []
         advice = Advice.STOP if stops else Advice.CARE if cares else Advice.FLY
         return LiveState(
             advice=advice,
-            reasons=tuple(stops or cares),
+            reasons=(*stops, *(care for care in cares if care not in stops)),
             readings=self._readings(now),
             nodes=tuple(self._said(node, now) for node in STAGES),
             refusals=tuple((now - time, why) for time, why in self._refusals if now - time < REFUSAL_S),
