@@ -25,6 +25,8 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 FASTEST = 50.0
 #: Longest time [s] over which the mapper extrapolates an odometry state to a frame.
 MAX_AGE = 0.3
+#: Covariance (6, 6) of an unknown acceleration of a brisk flight: 3 m/s^2, 4 rad/s^2.
+UNKNOWN_ACCELERATION: FloatArray = np.diag(np.repeat((3.0, 4.0), 3)) ** 2
 # A stamp farther back [ns] is not of a message that was overtaken: the clock was set, and all before is of another one.
 _REORDERED_NS = 100_000_000
 # Largest delay of frames, for which states are kept [ns].
@@ -142,11 +144,15 @@ def predicted_camera(
 def extrapolated(
     odometry: Odometry, dt: float, camera_stamp_ns: int, T_body_camera: FloatArray, clock_std: float
 ) -> PredictedCamera:
-    """The camera at a frame that is ``dt`` [s] after a state of the odometry, by clocks known to ``clock_std`` [s]."""
+    """The camera at a frame that is ``dt`` [s] after a state of the odometry, by clocks known to ``clock_std`` [s].
+
+    The covariance has the error of the twist during that time, and what an unknown acceleration may have changed.
+    """
     step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
     T_map_body = odometry.T_map_body @ step
     R, J = T_map_body[:3, :3], lever_arm(T_map_body[:3, :3] @ T_body_camera[:3, 3])
-    covariance = J @ odometry.pose_covariance @ J.T
+    moved = dt**2 * turned(odometry.twist_covariance, R) + 0.25 * dt**4 * UNKNOWN_ACCELERATION
+    covariance = J @ (odometry.pose_covariance + moved) @ J.T
     velocity = J @ np.concatenate([R @ odometry.velocity_body, R @ odometry.angular_velocity_body])
     covariance += covariance_of_one_error(velocity, clock_std)
     return PredictedCamera(CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), odometry, velocity)

@@ -11,10 +11,11 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.motion_prior import UNKNOWN_ACCELERATION
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: Covariance of an unknown acceleration; standard deviations in m/s^2, rad/s^2.
-RANDOM = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2
+#: Covariance of an unknown acceleration.
+RANDOM = UNKNOWN_ACCELERATION
 # Covariance of the acceleration by odometry, which changes between its states, for each second that they span.
 _CHANGES = 4.0 * RANDOM
 # Least covariance of a twist [m^2/s^2, rad^2/s^2].
