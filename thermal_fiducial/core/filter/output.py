@@ -16,11 +16,12 @@ from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, 
 from thermal_fiducial.core.measurements import Condition, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: (12, 12) Jacobian of position, rotation, velocity and rate of the robot by the core's errors and the gyroscope's
-#: bias, without the blocks that depend on attitude and velocity.
-_AT_REST = np.zeros((12, 12))
+#: (12, 18) Jacobian of position, rotation, velocity and rate of the robot by the core's errors, the gyroscope's bias
+#: and a motion of the map about its origin, without the blocks that depend on attitude, velocity and position.
+_AT_REST = np.zeros((12, 18))
 _AT_REST[6:9, VELOCITY] = np.eye(3)
-_AT_REST[9:, 9:] = -np.eye(3)
+_AT_REST[9:, 9:12] = -np.eye(3)
+_AT_REST[:6, 12:] = np.eye(6)
 #: Flat indices of the rate's variances in a (12, 12) matrix.
 _RATE_VARIANCES = slice(9 * 13, None, 13)
 #: A correction beyond this [m] is a new start of the filter: spreading it would only prolong the error.
@@ -40,26 +41,25 @@ def odometry(estimate: Estimate, contradicting: OtherEstimate | None, sample: La
     """
     state = estimate.state
     R, velocity_body = state.R_map_body, state.velocity_body
-    joint = estimate.covariance[PUBLISHED, PUBLISHED]
+    joint = np.zeros((18, 18))
+    joint[PUBLISHED, PUBLISHED] = estimate.covariance[PUBLISHED, PUBLISHED]
+    joint[12:, 12:] = estimate.pose_noise.last.map_covariance
     if contradicting:
         other = contradicting.estimate
         apart = _difference(state, other.state)
-        joint = joint.copy()
         joint[CORE, CORE] += other.covariance[CORE, CORE] + contradicting.odds * np.outer(apart, apart)
     # Position and rotation errors turn from the robot frame into the map; that of v_body depends on nu and phi.
     J = _AT_REST.copy()
     J[0:3, POSITION] = J[3:6, ROTATION] = R
-    J[6:9, ROTATION] = skew(velocity_body)
+    J[6:9, ROTATION], J[:3, 15:] = skew(velocity_body), -skew(state.position)
     covariance = J @ joint @ J.T
     covariance.reshape(-1)[_RATE_VARIANCES] += float(sample.densities[0]) ** 2 / sample.seconds
-    to_robot = lever_arm(state.position)
-    of_map = to_robot @ estimate.pose_noise.last.map_covariance @ to_robot.T
     return Odometry(
         estimate.stamp_ns,
         state.T_map_body,
         velocity_body,
         state.corrected(sample.imu)[:3],
-        covariance[:6, :6] + of_map,
+        covariance[:6, :6],
         covariance[6:, 6:],
     )
 

@@ -108,7 +108,8 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
     H = np.zeros((6, SIZE))
     H[_SIX, POSE] = 1.0
     H[:, EXTRINSICS] = H[:, SYSTEMATIC] = np.eye(6)
-    H[:, MARKERS] = pose.seen_from(prior.state.T_map_markers @ prior.state.T_map_body).by_map
+    T_map_body = prior.state.T_map_markers @ prior.state.T_map_body
+    H[:, MARKERS] = displacement_of_body(T_map_body, T_map_body[:3, 3])
     mount = mount_jacobian(prior.state)
     jitter = np.outer(derivative[POSE], derivative[POSE])
     units = np.stack((pose.shape, jitter, mount @ mount.T))
@@ -218,14 +219,17 @@ def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, inno
     """
     with_offset, motion = P[TIME_OFFSET], innovation.motion
     variance = float(with_offset[TIME_OFFSET])
-    followed = embedded_core(innovation.derivative - now)
-    half = np.outer(followed, with_offset + 0.5 * variance * followed)
+    followed = innovation.derivative - now
+    half = np.outer(followed, with_offset + 0.5 * variance * embedded_core(followed))
     noise = np.repeat((motion.rate_variance, motion.velocity_variance), 3)
     spurious = _SPURIOUS * float(innovation.S_inverse.diagonal() @ noise)
     widest = max(variance, config.time_offset_std**2)
     consistent = min(variance / max(1.0 - variance * spurious, _LEAST_KEPT), widest)
     by_offset = clock_offset_derivative(now)
-    return P + half + half.T + (consistent - variance) * np.outer(by_offset, by_offset)
+    P = P + (consistent - variance) * np.outer(by_offset, by_offset)
+    P[CORE] += half
+    P[:, CORE] += half.T
+    return P
 
 
 def _gained(config: PoseEkfConfig, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
