@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
@@ -18,6 +19,11 @@ _NEARLY_ALL, _FEW = 0.9, 3
 _WIDE_M = 0.1
 # Distance from the origin beyond which a position is probably in millimetres [m].
 _FAR_M = 1000.0
+# Distance from which a marker is seen at most, in its sides: 12 px (`min_side_px`) of 0.017 mm behind a lens of 100 mm,
+# the longest of a Tau 2.
+_SEEN_FROM = 500.0
+# Most IDs that a line names.
+_MOST_NAMES = 5
 
 
 class Doubt(NamedTuple):
@@ -37,7 +43,7 @@ def doubts(marker_map: MarkerMap) -> list[Doubt]:
         found.append(Doubt('no marker is fixed: a refinement has nothing to hold on to', False))
     for m in markers:
         found += _doubts_of(m)
-    return [*found, *_overlaps(markers), *_calibration(markers)]
+    return [*found, *_overlaps(markers), *_far_groups(markers), *_calibration(markers)]
 
 
 def _doubts_of(marker: MapMarker) -> list[Doubt]:
@@ -67,6 +73,27 @@ def _overlaps(markers: Sequence[MapMarker]) -> list[Doubt]:
             facing = rotation_angle(m.T_map_marker[:3, :3].T @ other.T_map_marker[:3, :3])
             apart = f'{near[j]:.3f} m and {np.rad2deg(float(facing)):.0f} deg apart'
             found.append(Doubt(f'markers {m.id} and {other.id} overlap: {apart}', m.trusted and other.trusted))
+    return found
+
+
+def _far_groups(markers: Sequence[MapMarker]) -> list[Doubt]:
+    """Groups of markers, but for the largest, so far from all others that no camera sees some of both."""
+    centres, reach = (
+        np.stack([m.T_map_marker[:3, 3] for m in markers]),
+        _SEEN_FROM * np.array([m.size for m in markers]),
+    )
+    apart = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    count, groups = connected_components(apart <= reach[:, None] + reach)
+    found = []
+    for group in set(range(count)) - {int(np.argmax(np.bincount(groups)))}:
+        inside = groups == group
+        ids = [str(markers[k].id) for k in np.flatnonzero(inside).tolist()]
+        more = f' and {len(ids) - _MOST_NAMES} more' if len(ids) > _MOST_NAMES else ''
+        names = f'{"marker" if len(ids) == 1 else "markers"} {", ".join(ids[:_MOST_NAMES])}{more}'
+        far = float(apart[inside][:, ~inside].min())
+        found.append(
+            Doubt(f'{names}: {far:.0f} m from all others, no camera sees both: positions are in metres', False)
+        )
     return found
 
 

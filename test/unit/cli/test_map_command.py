@@ -530,6 +530,18 @@ def test_whether_markers_overlap_does_not_depend_on_their_ids(sizes, apart, over
     assert [text[:23] for text in said] == ['markers 0 and 1 overlap'] * overlap
 
 
+def test_markers_far_from_all_others_are_doubted():
+    """A marker 300 m off, a slip of a survey, was in a map without a doubt."""
+    places = [0.0, 2.0, 4.0, 90.0, 180.0, 400.0]
+    markers = {k: MapMarker(k, 0.1, True, transform(np.eye(3), [x, 0.0, 1.0])) for k, x in enumerate(places)}
+    # 0.1 m is seen from 50 m: one camera sees two that are 90 m apart.
+    (text,) = (doubt.text for doubt in doubts(MarkerMap(markers)))
+    assert text == 'marker 5: 220 m from all others, no camera sees both: positions are in metres'
+    hall = {k + 10: MapMarker(k + 10, 0.1, True, transform(np.eye(3), [500.0, k, 1.0])) for k in range(7)}
+    said = [doubt.text for doubt in doubts(MarkerMap(markers | hall))]
+    assert said == ['markers 0, 1, 2, 3, 4: 220 m from all others, no camera sees both: positions are in metres']
+
+
 def test_large_residuals_of_all_markers_name_the_calibration(poses):
     def said(errors):
         markers = {
