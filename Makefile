@@ -1,5 +1,7 @@
 # make demo      set everything up and run the main job: simulate, replay through the four nodes, score, report
 # make test      set everything up, check the code and run all tests
+# make lint      style, types and layers alone
+# make tests     all tests alone: types are known to the stubs of the newest libraries only
 # make nightly   the long studies that "make test" has in a short form: many seeds, views and recordings
 # make coverage  all tests, with the branch coverage of the core: less than 95 % fails
 # make bench     accuracy and speed against OpenCV and a batch smoother, in the same run
@@ -13,6 +15,9 @@
 # make structure print how large and how deep the package is, beside what it aims at
 # make ablation  what each mechanism of detector, mapper and filter buys: figures with and without it
 # make docs      build the documentation as a web site in build/site; a link that leads nowhere fails it
+# make ready     install what all of these need, for several at a time
+# make format    let ruff put the code into shape
+# make clean     remove what these have made
 PYTHON ?= $(firstword $(foreach version,3.12 3.11,$(if $(shell python$(version) -c 'import venv, ensurepip' 2>/dev/null && echo yes),python$(version))) python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -31,7 +36,8 @@ QUIET_PIP := PYTHONWARNINGS='ignore:Editable installation'
 # A test that hangs ends with the stacks of its threads instead of the run; the longest takes 20 s, beside eight loops 3 min.
 LIMIT := --timeout 600 --timeout-method thread
 
-.PHONY: help demo test tests lint nightly coverage bench faults rigs soak restart fuzz latency tables structure docs format clean
+.PHONY: help demo test tests lint nightly coverage bench faults rigs soak restart fuzz latency tables structure ablation \
+	ready docs format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -57,7 +63,6 @@ lint: $(READY)
 
 test: lint tests
 
-# Without the types, which only the stubs of the newest libraries know.
 tests: $(READY)
 	@echo '== Tests (real data are used where THERMAL_FIDUCIAL_DATA names their folder)'
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal $(LIMIT) --durations 15 $(PYTEST_ARGS)
@@ -111,14 +116,12 @@ $(DOCS): setup.py $(READY)
 structure: $(READY)
 	$(BIN)/python test/structure.py
 
-.PHONY: ablation
 ablation: $(READY)
 	$(BIN)/python test/ablation.py
 	$(BIN)/python test/mapper_ablation.py
 	$(BIN)/python test/filter_ablation.py
 
 # All that the others install, for runs in parallel: none may find half of it.
-.PHONY: ready
 ready: $(READY) $(DOCS)
 
 docs: $(DOCS)
@@ -130,4 +133,5 @@ format: $(READY)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build install log runs .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) build install log runs *.egg-info .mypy_cache .ruff_cache .import_linter_cache .pytest_cache .hypothesis \
+		.benchmarks .coverage htmlcov

@@ -59,6 +59,14 @@ def test_the_design_names_functions_that_are_there():
     assert sorted(named - words) == []
 
 
+def test_make_help_lists_every_target():
+    makefile = (ROOT / 'Makefile').read_text(encoding='utf-8')
+    targets = set(re.findall(r'(?m)^([a-z]+):', makefile)) - {'help'}
+    assert set(re.findall(r'(?m)^# make (\w+)', makefile)) == targets
+    (phony,) = re.findall(r'(?m)^\.PHONY:((?:.*\\\n)*.*)$', makefile)
+    assert set(phony.replace('\\', '').split()) == targets | {'help'}
+
+
 def test_the_drawing_of_the_data_flow_is_one():
     drawings = [
         block
