@@ -44,7 +44,7 @@ class MapKeeper:
         self._writer: Thread | None = None
         #: why the last autosave could not be written; empty if it was
         self.fault = ''
-        #: whether the map has changed since it was loaded or saved
+        #: whether the map has changed since it was loaded, or copied to be saved
         self.unsaved = False
         #: why the last save could not replace the file; empty if it did
         self.obstacle = ''
@@ -109,6 +109,8 @@ class MapKeeper:
     def save(self, marker_map: MarkerMap) -> Path:
         """Write the map to its file, or beside it if the file is not the one that was loaded.
 
+        It leaves :attr:`unsaved` to whoever has copied the map: more may have been learned since.
+
         If that folder cannot be written to (full or read-only disk), a flown map is saved in the folder of the
         filter's last pose, or else in a new temporary folder.
 
@@ -123,8 +125,6 @@ class MapKeeper:
         """
         self.finish()
         self.obstacle = ''
-        # Set again by what is learned meanwhile.
-        self.unsaved = False
         try:
             self._read = map_history.save_with_history(self.path, marker_map, 'save', self._read)
         except InputError as error:

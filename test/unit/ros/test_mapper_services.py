@@ -4,6 +4,7 @@ from dataclasses import replace
 import errno
 import multiprocessing
 import os
+import threading
 
 import pytest
 from sensor_msgs.msg import PointCloud2
@@ -11,6 +12,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from thermal_fiducial.core.mapping.map_data import MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.files.map_history import entries
+from thermal_fiducial.files.map_keeper import MapKeeper
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.ros.base import qos
@@ -77,6 +79,20 @@ class Flown(MarkerMapperNode):
     def find(self, marker_id):
         self.mapper.map.markers[marker_id] = replace(self.mapper.map.markers[0], id=marker_id)
         self._map.note_learned()
+
+
+def test_what_is_found_while_a_disk_is_busy_is_saved_at_the_end(graph, map_file, monkeypatch):
+    """The save went on in a thread, and took what was found meanwhile for saved."""
+    node, idle = graph.add(Flown, map_file=str(map_file), mode='mapping'), threading.Event()
+    node.find(7)
+    with monkeypatch.context() as disk:
+        disk.setattr(MapKeeper, 'finish', lambda _: idle.wait(60.0))
+        assert ask(graph, 'save') == (False, f'{map_file}: the disk is busy; this goes on without an answer')
+        node.find(9)
+        idle.set()
+        graph.spin_until(lambda: entries(map_file))
+    node.close()
+    assert load_map(map_file).markers.keys() == {0, 7, 9}
 
 
 @pytest.mark.parametrize('name', ['load', 'undo'])

@@ -114,8 +114,13 @@ class MapServices:
 
     def save(self) -> str:
         """Write the map file, or another one if it cannot be replaced; returns a message with path and reason."""
-        marker_map = self.mapper.map.copy()
+        marker_map = self._copy_to_save()
         return self._in_time(lambda: self._save(marker_map))
+
+    def _copy_to_save(self) -> MarkerMap:
+        """A copy of the map; what is learned from now on is not in it, however long a disk takes."""
+        self._keeper.unsaved = False
+        return self.mapper.map.copy()
 
     def _save(self, marker_map: MarkerMap) -> str:
         path = self._keeper.save(marker_map)
@@ -186,13 +191,15 @@ class MapServices:
         try:
             self.refinement.close()
         finally:
+            # A save that goes on would be taken for that of another program.
+            self._disk.shutdown()
             self._save_at_the_end()
 
     def _save_at_the_end(self) -> None:
         file = self._node.config.map_file
         lost = not self.mapper.frozen and not is_there(file)
         if file and (self._keeper.unsaved or lost) and self.mapper.map.markers:
-            line, logger = self._save(self.mapper.map), self._node.get_logger()
+            line, logger = self._save(self._copy_to_save()), self._node.get_logger()
             if self._keeper.obstacle:
                 logger.warning(line)
             else:
