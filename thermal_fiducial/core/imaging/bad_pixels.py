@@ -65,7 +65,8 @@ def _stands_out(counts: Counts, surroundings: Counts, margin_counts: float) -> I
     ``surroundings``, the median of each pixel's neighbourhood, leaves few candidates.
     """
     width = counts.shape[1]
-    candidates = np.flatnonzero(cv2.absdiff(counts, surroundings) > margin_counts)
+    # As whole numbers: numpy would make floating-point numbers of all pixels.
+    candidates = np.flatnonzero(cv2.absdiff(counts, surroundings) > int(margin_counts))
     rows, columns = np.divmod(candidates, width)
     # Mirrored at the border, so that no pixel is its own neighbour.
     padded = cv2.copyMakeBorder(counts, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)

@@ -130,10 +130,10 @@ class FrameCleaner:
         image = self._without_telemetry(counts, extra) if extra else counts
         if min(image.shape) < 16:
             raise InputError(f'frame of {image.shape[1]}x{image.shape[0]} pixels is too small')
-        return self._without_flags(image.astype(np.uint16))
+        return self._without_flags(image)
 
-    def _without_flags(self, counts: Counts) -> Counts:
-        """Counts without the shift of the driver and without flag bits, in place."""
+    def _without_flags(self, counts: Counts | Gray) -> Counts:
+        """A copy of the counts without the shift of the driver and without flag bits."""
         sample, bits = counts[:: FreezeDetector.ROW_STEP], self.config.bits
         # Some drivers shift counts up; without a shift, noise sets the lowest bits of some pixels. A shift shows where
         # counts need more bits than they have, and stays; a frame of nothing but zeros has no lowest bit.
@@ -142,12 +142,10 @@ class FrameCleaner:
         if 0 <= lowest < _SHIFTED or used >> bits:
             self._believe_shift(lowest if lowest >= _SHIFTED else 0)
         if self._shift:
-            counts >>= np.uint16(self._shift)
+            counts = counts >> np.uint16(self._shift)
         elif used >> bits and self._carrying < _FRAMES_WITH_CARRIES:
             self._carrying = self._carrying + 1 if _carries(sample, bits) else 0
-        if not self._carrying:
-            counts &= np.uint16((1 << bits) - 1)
-        return counts
+        return np.bitwise_and(counts, np.uint16((1 << (16 if self._carrying else bits)) - 1), dtype=np.uint16)
 
     def _believe_shift(self, shown: int) -> None:
         """Take over the shift that a frame shows, unless the frame stands alone with it."""
@@ -173,7 +171,7 @@ class FrameCleaner:
         self._filler.fill(image)
 
 
-def _carries(rows: Counts, bits: int) -> bool:
+def _carries(rows: Counts | Gray, bits: int) -> bool:
     """Whether the bits above ``bits`` belong to the counts of ``rows`` (N, width), and are no flags.
 
     Where counts pass a multiple of 2^bits, neighbours are alike as a whole and apart by nearly all of 2^bits without
@@ -216,11 +214,11 @@ class FreezeDetector:
 
 def _repeated_rows(sample: Counts, earlier: Counts) -> float:
     """Share of the rows that repeat, of those that could change: clipped rows at the end of the scale cannot."""
-    # Hardly any two rows with noise begin with the same pixels; only those are compared whole.
-    same = sample[:, 0] == earlier[:, 0]
-    same[same] = np.all(sample[same] == earlier[same], axis=1)
+    # Hardly any two rows with noise begin with the same four pixels; only those are compared whole.
+    same = (sample[:, :4] == earlier[:, :4]).all(axis=1)
     if not same.any():
         return 0.0
+    same[same] = (sample[same] == earlier[same]).all(axis=1)
     clipped = sample.max(axis=1) == sample.min(axis=1)
     # Dead and stuck pixels stand out of a clipped row, and do not change either.
     at_either_end = (sample == sample.min()) | (sample == sample.max())
@@ -316,6 +314,6 @@ def _structure(image: Counts) -> float:
     The median removes bad pixels, the mean most of the noise.
     """
     patches = cv2.resize(cv2.medianBlur(np.ascontiguousarray(image[::4, ::4]), 3), None, fx=0.5, fy=0.5)
-    steps = np.abs(np.diff(patches.astype(np.int32), axis=0)).ravel()
-    steps = np.concatenate([steps, np.abs(np.diff(patches.astype(np.int32), axis=1)).ravel()])
+    down, across = cv2.absdiff(patches[1:], patches[:-1]), cv2.absdiff(patches[:, 1:], patches[:, :-1])
+    steps = np.concatenate([down.ravel(), across.ravel()])
     return float(np.partition(steps, -10)[-10])
