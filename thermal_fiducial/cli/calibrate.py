@@ -16,7 +16,7 @@ from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.cli.ranges import IMU_NOISE
-from thermal_fiducial.cli.subcommands import add_remap, file_to_write
+from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
@@ -43,7 +43,8 @@ _REMEDY = 'record a minute with turns about all three axes and motion along them
 def add_arguments(parser: Parser) -> None:
     """Sub-commands of ``calibrate``."""
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
-    calibrate_intrinsics.add_arguments(add_command(commands, 'intrinsics', 'camera_info from thermal views of a board'))
+    what = 'intrinsics (camera_info) from thermal views of a board'
+    calibrate_intrinsics.add_arguments(add_command(commands, 'intrinsics', what))
     _add_camera_imu(add_command(commands, 'camera-imu', 'pose and clock of the camera relative to the IMU'))
     add_imu(add_command(commands, 'imu', 'noise densities of an IMU at rest'))
 
@@ -70,6 +71,7 @@ def _add_camera_imu(parser: Parser) -> None:
     )
     add_thickness(parser)
     parser.add_argument('--out', type=file_to_write, default=Path('extrinsics.yaml'), help='parameters to write')
+    add_force(parser)
     noise = ImuNoise()
     for name, unit in (
         ('gyroscope_noise_density', 'rad/s/sqrt(Hz)'),
@@ -88,6 +90,7 @@ def _camera_imu(args: argparse.Namespace) -> int:
     # Takes half a second to import, which the other calibrations do not need.
     from thermal_fiducial.calibration.camera_imu import calibrate_rolling_camera_imu
 
+    refuse_to_overwrite([args.out], args.force)
     noise = ImuNoise(
         args.gyroscope_noise_density,
         args.accelerometer_noise_density,

@@ -8,7 +8,7 @@ import numpy as np
 
 from thermal_fiducial.calibration.sources import imu_track, imu_track_of_csv
 from thermal_fiducial.cli.parser import Parser
-from thermal_fiducial.cli.subcommands import add_remap, file_to_write
+from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagReader, parse_remaps
@@ -35,6 +35,7 @@ def add_imu(parser: Parser) -> None:
         '(stamp [ns], turn rates x y z [rad/s], accelerations x y z [m/s^2])',
     )
     parser.add_argument('--out', type=file_to_write, default=Path('imu.yaml'), help='parameters to write')
+    add_force(parser)
     add_remap(parser)
     parser.refuse(['--remap'], 'with a CSV file of samples', _is_csv)
 
@@ -48,6 +49,7 @@ def calibrate_imu(args: argparse.Namespace) -> int:
     # allantools takes a second to import, which the other calibrations do not need.
     from thermal_fiducial.calibration.allan_deviation import fit_noise
 
+    refuse_to_overwrite([args.out], args.force)
     if _is_csv(args):
         track = imu_track_of_csv(args.source)
     else:

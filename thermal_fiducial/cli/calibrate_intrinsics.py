@@ -19,7 +19,7 @@ from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pi
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.ranges import BOARD_MM, BOARD_POINTS, FOCAL_PX, IMAGE_PX, MORE_POINTS
-from thermal_fiducial.cli.subcommands import add_remap, file_to_write, whole_number
+from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite, whole_number
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.mapping.map_data import MarkerMap
@@ -51,6 +51,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         '--report', type=file_to_write, help='report to write (default: next to the calibration, .html)'
     )
+    add_force(parser)
     parser.add_argument(
         '--models', default=','.join(CANDIDATES), metavar='NAMES', help='models to choose among, by held-out error'
     )
@@ -124,8 +125,9 @@ def _intrinsics(args: argparse.Namespace) -> int:
     unknown = set(models) - set(CANDIDATES)
     if unknown:
         raise InputError(f'--models are {", ".join(CANDIDATES)}, not {", ".join(sorted(unknown))}')
-    views = _views(args)
     page = args.report or args.out.with_suffix('.html')
+    refuse_to_overwrite([args.out, _covariance_file(args.out), page], args.force)
+    views = _views(args)
     try:
         result, fits = _solved(views, args, models)
     except InputError as reason:
@@ -210,7 +212,6 @@ def mapped_detector(board: MarkerMap, thickness: float = 0.0) -> MarkerDetector:
 
 def _save_covariance(out: Path, result: Calibration, error: ImageError) -> None:
     """Write the covariance beside the calibration, whose format has no field for it."""
-    path = out.with_name(f'{out.stem}_covariance.yaml')
     rows = result.parameter_rows()
     document = {
         'parameters': [name for name, _, _ in rows],
@@ -223,7 +224,11 @@ def _save_covariance(out: Path, result: Calibration, error: ImageError) -> None:
         'sigma_covered_px': error.inside_px,
         'sigma_not_covered_px': error.outside_px,
     }
-    write_text(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
+    write_text(_covariance_file(out), yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
+
+
+def _covariance_file(out: Path) -> Path:
+    return out.with_name(f'{out.stem}_covariance.yaml')
 
 
 def _warn_of_focal_length(result: Calibration) -> None:

@@ -13,6 +13,7 @@ from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import BOARD_POINTS, CELLS, LENGTH_MM
+from thermal_fiducial.cli.subcommands import add_force, refuse_to_overwrite
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
@@ -206,25 +207,6 @@ def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cel
             for complaint in strength.complaints:
                 print(f'warning: marker {drawing.name}: {complaint}', file=sys.stderr)
             progress(done / len(drawings))
-
-
-def add_force(parser: Parser) -> None:
-    """Add the option that allows overwriting files."""
-    parser.add_argument('--force', action='store_true', help='overwrite files that exist')
-
-
-def refuse_to_overwrite(paths: Iterable[Path], force: bool) -> None:
-    """Refuse to overwrite files, before any is written.
-
-    Raises
-    ------
-    InputError
-        One of ``paths`` exists, without ``force``.
-    """
-    existing = [] if force else [path for path in paths if path.exists()]
-    if existing:
-        others = f' and {len(existing) - 1} more' if len(existing) > 1 else ''
-        raise InputError(f'{existing[0]}{others}: the file exists; --force overwrites it')
 
 
 def _markers(args: argparse.Namespace) -> Iterable[Drawing]:

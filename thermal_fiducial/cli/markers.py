@@ -8,7 +8,7 @@ from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import BITS, HAMMING, LENGTH_MM
-from thermal_fiducial.cli.subcommands import file_to_write, whole_number
+from thermal_fiducial.cli.subcommands import add_force, file_to_write, refuse_to_overwrite, whole_number
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.core.wording import number_of
@@ -120,11 +120,11 @@ def _add_dictionary(parser: Parser) -> None:
     parser.add_argument(
         '--signed', action='store_true', help='keep the distance also from the negatives of all markers'
     )
-    marker_drawings.add_force(parser)
+    add_force(parser)
 
 
 def _dictionary(args: argparse.Namespace) -> int:
-    marker_drawings.refuse_to_overwrite([args.out], args.force)
+    refuse_to_overwrite([args.out], args.force)
     with progress_bar('searching') as progress:
         bits = search(
             args.bits,

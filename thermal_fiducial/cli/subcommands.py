@@ -1,7 +1,7 @@
 """Arguments that many commands have, and types of arguments."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 import math
 from pathlib import Path
 
@@ -81,3 +81,22 @@ def file_to_write(text: str) -> Path:
     if path.is_dir():
         raise argparse.ArgumentTypeError(f'{path}: is a folder, not a file to write')
     return path
+
+
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """Add the option that allows overwriting files."""
+    parser.add_argument('--force', action='store_true', help='overwrite files that exist')
+
+
+def refuse_to_overwrite(paths: Iterable[Path], force: bool) -> None:
+    """Refuse to overwrite files, before any is written.
+
+    Raises
+    ------
+    InputError
+        One of ``paths`` exists, without ``force``.
+    """
+    existing = [] if force else [path for path in paths if path.exists()]
+    if existing:
+        others = f' and {len(existing) - 1} more' if len(existing) > 1 else ''
+        raise InputError(f'{existing[0]}{others}: the file exists; --force overwrites it')

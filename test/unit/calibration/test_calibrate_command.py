@@ -117,7 +117,7 @@ def test_camera_against_imu_leaves_out_markers_in_quarantine(tmp_path):
     quarantined = replace(known.markers[2], T_map_marker=moved, trusted=False)
     for others in ({}, {2: quarantined}):
         save_map(marker_map, replace(known, markers={key: known.markers[key] for key in (0, 1)} | others))
-        found.append(calibrated(bag, marker_map, tmp_path / 'extrinsics.yaml'))
+        found.append(calibrated(bag, marker_map, tmp_path / f'{len(others)}.yaml'))
     assert found[0] == found[1]
 
 
@@ -297,6 +297,33 @@ def _measured_views(tilt_deg, shrunk=1):
             if 0.0 < u < 640 // shrunk - 1 and 0.0 < v < 512 // shrunk - 1:
                 lines.append(f'{view},{point},{u:.4f},{v:.4f},{x:.4f},{y:.4f}')
     return lines
+
+
+def test_a_calibration_that_is_there_is_kept_unless_forced(tmp_path, capsys):
+    """A second run, of worse views say, replaced the calibration that the robot flies on."""
+    source, out = tmp_path / 'points.csv', tmp_path / 'lens.yaml'
+    source.write_text('\n'.join(_measured_views(35.0)))
+    words = ['calibrate', 'intrinsics', str(source), '--size', '640', '512', '--models', 'plumb_bob', '--out', str(out)]
+    for name in ('lens.yaml', 'lens_covariance.yaml', 'lens.html'):
+        place = tmp_path / name
+        place.write_text('kept')
+        assert main(words) == 2
+        assert f'{place}: the file exists; --force overwrites it' in capsys.readouterr().err
+        assert place.read_text() == 'kept'
+        place.unlink()
+    out.write_text('kept')
+    assert main([*words, '--force']) == 0
+    assert 'plumb_bob' in out.read_text()
+
+
+@pytest.mark.parametrize('action', ['camera-imu', 'imu'])
+def test_calibrated_parameters_that_are_there_are_kept(tmp_path, capsys, action):
+    out = tmp_path / 'found.yaml'
+    out.write_text('kept')
+    options = ['--map', str(tmp_path / 'map.yaml')] if action == 'camera-imu' else []
+    assert main(['calibrate', action, str(tmp_path / 'bag'), *options, '--out', str(out)]) == 2
+    assert f'{out}: the file exists; --force overwrites it' in capsys.readouterr().err
+    assert out.read_text() == 'kept'
 
 
 @pytest.mark.parametrize('points', [(40,), (0, 1, 2), (0, 1, 2, 3, 4, 5, 6), (0, 1, 2, 8)])
