@@ -8,14 +8,14 @@ from sensor_msgs.msg import CameraInfo, TimeReference
 
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.plausibility import doubt_of_resolution
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.camera_nodes.latest_calibration import LatestCalibration
 from thermal_fiducial.ros.frames.robot_frames import RobotFrames
-from thermal_fiducial.ros.messages import convert, message_bytes
+from thermal_fiducial.ros.messages import message_bytes
 
 Config = TypeVar('Config', bound=ArucoDetectorConfig | MarkerMapperConfig)
 
@@ -25,15 +25,13 @@ class CameraStageNode(StageNode[Config]):
 
     def __init__(self, name: str, kind: type[Config], **kwargs: Any) -> None:
         super().__init__(name, kind, **kwargs)
-        self._camera: Camera | None = None
-        self._camera_info = b''
-        self._calibrations = 0
+        self._calibration = LatestCalibration(self)
         #: the filter's latest states
         self.odometry = MotionPrior(self.config.camera_time_offset, self._read_odometry)
 
     def follow_hints(self) -> None:
         """Subscribe to calibration and odometry; call it after subscribing to the node's main input."""
-        self.subscribe_lazily(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
+        self.subscribe_lazily(CameraInfo, 'thermal/camera_info', self._calibration.take, qos.CAMERA_INPUT)
         self.subscribe_lazily(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT)
         RobotFrames(self)
         # One for each pose of a camera: that there are none is for the filter to say.
@@ -47,13 +45,11 @@ class CameraStageNode(StageNode[Config]):
         InputError
             None has been received yet.
         """
-        if self._camera is None:
-            raise InputError('no camera_info')
-        return self._camera
+        return self._calibration.camera()
 
     def figures(self) -> dict[str, object]:
         """Number of different calibrations received."""
-        return {'calibrations': self._calibrations}
+        return {'calibrations': self._calibration.count}
 
     def _on_odometry(self, message: bytes) -> None:
         """Keep odometry serialised: only the few states that a frame needs are decoded."""
@@ -71,17 +67,3 @@ class CameraStageNode(StageNode[Config]):
 
     def _on_camera_clock(self, message: bytes) -> None:
         self.odometry.set_clock_offset(message_bytes.clock_offset(message))
-
-    def _on_camera_info(self, message: bytes) -> None:
-        """Validate a calibration if it differs from the last one; most drivers repeat it with each frame."""
-        if message[message_bytes.BEHIND_STAMP :] == self._camera_info:
-            return
-        camera = convert.camera(message_bytes.read(message, CameraInfo, 'camera_info'))
-        self._camera_info = message[message_bytes.BEHIND_STAMP :]
-        if self._camera is not None and camera.matches(self._camera):
-            return
-        self._camera = camera
-        self.remark(filter(None, [doubt_of_resolution(camera)]))
-        self._calibrations += 1
-        if self._calibrations > 1:
-            self.get_logger().warning('camera_info has changed: the new calibration is used from here on')

@@ -7,16 +7,15 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.second_camera import SecondCamera
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.camera_nodes.camera_node import CameraStageNode
+from thermal_fiducial.ros.camera_nodes.latest_calibration import LatestCalibration
 from thermal_fiducial.ros.frames.map_corrections import LatePoses
-from thermal_fiducial.ros.messages import clouds, convert
+from thermal_fiducial.ros.messages import clouds
 from thermal_fiducial.ros.messages.message_bytes import PoseBytes
 
 
@@ -35,7 +34,7 @@ class CameraPoses:
         self._map_error = node.advertise(PoseWithCovarianceStamped, 'camera_pose/map_error')
         self._bytes = PoseBytes(node.config.map_frame)
         self._config = node.config
-        self._camera: Camera | None = None
+        self._calibration = LatestCalibration(node, node.config.second_camera)
         self._second: SecondCamera | None = None
         self._locator: MarkerMapper | None = None
         #: why the last frame of the second camera gave no pose, in words
@@ -45,7 +44,7 @@ class CameraPoses:
             self._second = _second_of(node.config)
             self._locator = MarkerMapper(_alone(node.config), mapper.map)
             node.subscribe_newest(PointCloud2, f'{name}/markers', self._on_second, qos.RESULT, raw=True)
-            node.subscribe(CameraInfo, f'{name}/thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
+            node.subscribe_lazily(CameraInfo, f'{name}/thermal/camera_info', self._calibration.take, qos.CAMERA_INPUT)
 
     def configure(self) -> None:
         """Apply dynamic parameters; only a camera that has moved on the robot makes the clocks' difference unknown."""
@@ -73,16 +72,12 @@ class CameraPoses:
         self._map_error.send(self._bytes.of(pose.map_covariance))
         self._output.send(self._bytes.of(pose.covariance))
 
-    def _on_camera_info(self, message: CameraInfo) -> None:
-        self._camera = convert.camera(message)
-
     def _on_second(self, message: bytes) -> None:
-        if self._camera is None:
-            raise InputError(f'no camera_info of {self._config.second_camera}')
+        camera = self._calibration.camera()
         if self._second is None or self._locator is None:
             return
         self._locator.use_map_of(self._mapper)
-        result = self._locator.process(*clouds.stamped_markers(message), self._camera, self._node.odometry)
+        result = self._locator.process(*clouds.stamped_markers(message), camera, self._node.odometry)
         self._reason = '' if result.pose is not None else result.reason
         alone = None if result.pose is None else self._second.add_second(result.pose, self._node.odometry)
         if alone is not None:

@@ -1,0 +1,55 @@
+"""The calibration of a camera as its driver repeats it, mostly with each frame."""
+
+from typing import Any
+
+from sensor_msgs.msg import CameraInfo
+
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.plausibility import doubt_of_resolution
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.messages import convert, message_bytes
+
+
+class LatestCalibration:
+    """The last valid ``camera_info`` of a topic.
+
+    Parameters
+    ----------
+    node : whose remarks tell of a calibration that is doubted
+    name : of the second camera; empty: the first
+    """
+
+    def __init__(self, node: StageNode[Any], name: str = '') -> None:
+        self._node = node
+        self._what = f'camera_info of {name}' if name else 'camera_info'
+        self._camera: Camera | None = None
+        self._message = b''
+        #: number of different calibrations received
+        self.count = 0
+
+    def camera(self) -> Camera:
+        """The calibration.
+
+        Raises
+        ------
+        InputError
+            None has been received yet.
+        """
+        if self._camera is None:
+            raise InputError(f'no {self._what}')
+        return self._camera
+
+    def take(self, message: bytes) -> None:
+        """Validate a serialised ``camera_info`` if it differs from the last one."""
+        if message[message_bytes.BEHIND_STAMP :] == self._message:
+            return
+        camera = convert.camera(message_bytes.read(message, CameraInfo, 'camera_info'))
+        self._message = message[message_bytes.BEHIND_STAMP :]
+        if self._camera is not None and camera.matches(self._camera):
+            return
+        self._camera = camera
+        self._node.remark(filter(None, [doubt_of_resolution(camera)]))
+        self.count += 1
+        if self.count > 1:
+            self._node.get_logger().warning(f'{self._what} has changed: the new calibration is used from here on')
