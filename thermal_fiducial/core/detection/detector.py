@@ -86,12 +86,11 @@ class MarkerDetector:
         config, known, history = self.config, self._known, self._history
         prediction = predict_frame(stamp_ns, prior, history.track, config.max_odometry_age, config.time_offset_std)
         T_camera_map = prediction.T_camera_map
+        # By which known markers are looked for.
+        guide = T_camera_map if config.guided and len(known.ids) else None
         keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
         frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)
-        expected = None
-        if T_camera_map is not None and len(known.ids) and config.guided:
-            expected = known.expected(T_camera_map, camera, config.min_side_px)
-        found, history = self._finder.find(frame, history, known, expected, config)
+        found, history = self._finder.find(frame, history, known, guide, config)
         refined, scale = refine(frame, found, history.track, history.gray_scale, self._decoder, config)
         refined = confirmed(frame, found, refined, self._decoder, config)
         ids, corners = refined.ids, refined.corners
@@ -101,8 +100,8 @@ class MarkerDetector:
             at = corners_of_faces(at, poses.T_camera_marker[:, 0], known.sizes[ids], config.plate_thickness)
             poses = self._poses(ids, corners.covariances, at, T_camera_map)
         rows = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
-        if T_camera_map is not None and expected is not None and among(ids, known.ids).sum() < _ENOUGH_WHOLE:
-            rows = self._with_partial(rows, frame, scale, T_camera_map, prediction.position_std_m)
+        if guide is not None and among(ids, known.ids).sum() < _ENOUGH_WHOLE:
+            rows = self._with_partial(rows, frame, scale, guide, prediction.position_std_m)
         # A twist by corners of which none was confirmed as a marker's is dropped.
         twist = refined.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], known.sizes[ids])

@@ -13,7 +13,7 @@ import numpy as np
 
 from thermal_fiducial.core.detection.prediction.frame import without_tails
 from thermal_fiducial.core.geometry.reprojection import bilinear, seen_between
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
 
 # Distance from a side at which black and white are compared [cells].
 _OUTSIDE = 0.4
@@ -161,7 +161,7 @@ class Decoder:
 
     def likeness(
         self,
-        image: Float32Array,
+        image: Counts | Gray | Float32Array,
         quads: FloatArray,
         allowed: BoolArray | None = None,
         lag_tails: FloatArray | None = None,
@@ -251,7 +251,7 @@ def _in_plate(cells: int, margin: float) -> FloatArray:
     return bilinear(np.array([low, high, high, low]), np.array([low, low, high, high]))
 
 
-def sampled(image: Float32Array, places: Float32Array) -> Float32Array:
+def sampled(image: Counts | Gray | Float32Array, places: Float32Array) -> Float32Array:
     """Values (Q, P) of the image at columns and rows (2, Q, P)."""
     parts = [
         cv2.remap(image, part[0], part[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -20,6 +20,7 @@ from thermal_fiducial.sim.thermal_camera import render_frames
 SCENARIO = named('wall')
 LENS = SCENARIO.lens
 CAMERA = Camera(LENS.width, LENS.height, LENS.matrix, LENS.model, LENS.distortion)
+NONE = np.zeros(0, dtype=np.int64)
 MAP = {marker.id: (marker.T_map_marker, marker.size) for marker in SCENARIO.markers}
 CONFIG = ArucoDetectorConfig(
     camera_position=SCENARIO.camera_position,
@@ -50,12 +51,14 @@ def detector(**changes):
 
 def test_expected_markers_are_those_in_view():
     frame = frames(8.0, 1)[0]
-    expected = KnownMarkers(MAP, np.ones(50)).expected(se3.inverse(frame.T_map_camera), CAMERA, 12.0)
+    expected = KnownMarkers(MAP, np.ones(50)).expected(se3.inverse(frame.T_map_camera), CAMERA, 12.0, NONE)
     assert set(frame.corners_px) >= set(expected.ids.tolist())
     for marker_id, corners in zip(expected.ids.tolist(), CAMERA.distort(expected.x), strict=True):
         np.testing.assert_allclose(corners, frame.corners_px[marker_id], atol=1e-6)
     assert np.all(expected.depth > 1.0)
-    assert len(KnownMarkers({}, np.ones(50)).expected(np.eye(4), CAMERA, 12.0).ids) == 0
+    others = KnownMarkers(MAP, np.ones(50)).expected(se3.inverse(frame.T_map_camera), CAMERA, 12.0, expected.ids[1:])
+    np.testing.assert_array_equal(others.x, expected.x[:1])
+    assert len(KnownMarkers({}, np.ones(50)).expected(np.eye(4), CAMERA, 12.0, NONE).ids) == 0
 
 
 def test_finds_markers_of_the_noise_s_own_contrast():

@@ -139,12 +139,11 @@ def _measured(
     whole = too_blurred_for_sides(start.px, decoder.cells, config.blur_px, blur)
     if whole.all():
         return _by_patterns(frame, found, start, blur, decoder, config)
-    others, of_sides = start.only(~whole), blur.only(~whole)
+    others, of_sides = (start.only(~whole), blur.only(~whole)) if whole.any() else (start, blur)
     # On displays sides are where fits of patterns begin.
     passes = 1 if frame.displayed else PASSES
-    refined = refine_corners(
-        frame.image, others, frame.camera, decoder.cells, config.blur_px, columns, of_sides, passes
-    )
+    image = frame.pixels if blur.to_tails is None else frame.image
+    refined = refine_corners(image, others, frame.camera, decoder.cells, config.blur_px, columns, of_sides, passes)
     if frame.displayed:
         # Fits of large patterns do not converge from corners that are off by half a cell.
         px = start.px.copy()

@@ -32,7 +32,7 @@ from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.corners.uneven_contrast import freed_of_unevenness
 from thermal_fiducial.core.detection.prediction.frame import counts_of, MotionBlur
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
 #: Columns of pixels per cell for clear markers, and for faint ones.
 OF_CLEAR, OF_FAINT = 6, 12
@@ -47,7 +47,7 @@ _SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
 
 
 def refine_corners(
-    image: Float32Array,
+    image: Counts | Gray | Float32Array,
     corners: ImagePoints,
     camera: Camera,
     cells: int,

@@ -31,7 +31,7 @@ from thermal_fiducial.core.geometry.reprojection import diagonals
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS
 
 # Polarity: memory in frames that show markers, and the surplus of markers of one polarity from which on it is certain.
-_FRAMES, _SURE = 30, 6.0
+_FRAMES, _SURE = 30.0, 6.0
 # The same without markers [s]: half a minute until a certain polarity is open again. Sheets take minutes to become
 # colder than what is behind them; and the first marker after a gap is often in motion blur, in which the plate around a
 # dark marker resembles a bright one.
@@ -71,7 +71,7 @@ class FrameHistory:
     def _balance_after(self, stamp_ns: int, surplus: float) -> float:
         """The balance after a frame with a ``surplus`` of dark over bright markers."""
         if surplus != 0.0:
-            return float(np.clip(self.balance * (1.0 - 1.0 / _FRAMES) + surplus, -_FRAMES, _FRAMES))
+            return min(max(self.balance * (1.0 - 1.0 / _FRAMES) + surplus, -_FRAMES), _FRAMES)
         before_ns = self.track.stamp_ns
         elapsed_ns = 0 if before_ns is None else max(stamp_ns - before_ns, 0)
         return self.balance * math.exp(-elapsed_ns / (_REMEMBERED_S * SECOND_NS))
@@ -99,17 +99,18 @@ class MarkerFinder:
         frame: Frame,
         history: FrameHistory,
         known: KnownMarkers,
-        in_map: ExpectedMarkers | None,
+        T_camera_map: FloatArray | None,
         config: ArucoDetectorConfig,
     ) -> tuple[FoundMarkers, FrameHistory]:
         """Markers at the frame's stamp, accurate to a pixel or two, and the history with the blind search after it.
 
-        ``in_map``: predictions of the map's markers.
+        ``T_camera_map`` (4, 4): by which the map's markers are predicted; None: they are not.
         """
+        in_map: ExpectedMarkers | None = None
         if frame.twist is None or not config.guided:
             found, complete, holds = FoundMarkers.none(), False, False
         else:
-            found, number = self._guided(frame, frame.twist, history, known, in_map, config)
+            found, number, in_map = self._guided(frame, frame.twist, history, known, T_camera_map, config)
             complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
             enough = complete or (number > 0 and len(found.ids) >= _ENOUGH * number)
             holds = in_map is not None and enough
@@ -126,26 +127,28 @@ class MarkerFinder:
         twist: Twist,
         history: FrameHistory,
         known: KnownMarkers,
-        in_map: ExpectedMarkers | None,
+        T_camera_map: FloatArray | None,
         config: ArucoDetectorConfig,
-    ) -> tuple[FoundMarkers, int]:
-        """Markers found at their predictions, from the last frame and from the map; number of predictions."""
+    ) -> tuple[FoundMarkers, int, ExpectedMarkers | None]:
+        """Markers found at their predictions, from the last frame, else from the map.
+
+        And the number of predictions, and those from the map, of markers that could not be followed.
+        """
         last = history.track.expected(frame.stamp_ns, twist)
         places = Places.of(ImagePoints.seen_at(last.x, frame.camera), last.depth)
         wanted: BoolArray = np.asarray(frame.camera.contains(places.at.px, CUT_OFF_PX).all(axis=1))
-        if in_map is None:
-            expected = last.only(wanted)
-        else:
-            others = wanted & ~among(last.ids, known.ids)
-            expected = in_map.joined(last.only(others)) if others.any() else in_map
-            wanted &= among(last.ids, expected.ids)
         if not wanted.all():
             last, places = last.only(wanted), places.only(wanted)
-        found = followed(frame, twist, last, places, self._decoder, config)
-        new = ~among(expected.ids, found.ids)
-        if new.any():
-            found = found.and_elsewhere(near_prediction(frame, twist, expected.only(new), self._decoder, config))
-        return found, len(expected.ids)
+        found, in_map = followed(frame, twist, last, places, self._decoder, config), None
+        lost = ~among(last.ids, found.ids)
+        if T_camera_map is not None:
+            in_map = known.expected(T_camera_map, frame.camera, config.min_side_px, without=found.ids)
+            lost &= ~among(last.ids, known.ids)
+        missing = last.only(lost) if in_map is None else in_map.joined(last.only(lost))
+        number = len(found.ids) + len(missing.ids)
+        if len(missing.ids):
+            found = found.and_elsewhere(near_prediction(frame, twist, missing, self._decoder, config))
+        return found, number, in_map
 
     def _blind(
         self,
@@ -207,7 +210,7 @@ def followed(
     if len(last.ids) == 0:
         return FoundMarkers.none()
     shown = places.at.px + places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
-    likeness = decoder.likeness(frame.image, shown)
+    likeness = decoder.likeness(frame.pixels, shown)
     similarity = likeness.correlation * np.sign(last.cnr)
     alike = (likeness.best == 4 * last.ids) & (similarity > _STILL_SIMILAR)
     alike &= (frame.camera.contains(shown) & frame.camera.shows(shown)).all(axis=1)

@@ -16,6 +16,7 @@ With an acceleration a, the image of s ago lies s w - s^2 a / 2 behind. The mean
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 import math
 from typing import NamedTuple
 
@@ -33,6 +34,8 @@ from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatAr
 LEAST_DEPTH = 1e-3
 # Number of gray levels up to which a frame counts as a picture for a display.
 _LEVELS = 256
+# -1 for black, 1 for white.
+_SIGNS = np.array([-1.0, *[0.0] * (_LEVELS - 2), 1.0], dtype=np.float32)
 # Rows that are looked at for it are so far apart: the first one alone may be dead, or carry telemetry.
 _ROW_STEP = 16
 # Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken
@@ -59,8 +62,8 @@ class Frame:
     """An image with its noise, calibration and the predicted twist of the camera."""
 
     stamp_ns: int
-    #: (height, width) counts as floating-point numbers
-    image: Float32Array
+    #: (height, width) as received where columns keep their fixed pattern, else counts without it
+    pixels: Counts | Gray | Float32Array
     #: standard deviation of a pixel [counts]
     noise: float
     camera: Camera
@@ -70,10 +73,10 @@ class Frame:
     readout: float
     #: whether it is a picture for a display, whose gain control is a nonlinear function of the counts
     displayed: bool = False
-    #: where its gray scale ends; None: nowhere, or raw counts
-    saturation: 'Saturation | None' = None
     #: (height, width) as received
     received: Counts | Gray | None = None
+    #: counts of black and of white in a picture for a display
+    ends: tuple[float, float] = (0.0, _LEVELS - 1.0)
 
     @staticmethod
     def of(
@@ -87,12 +90,19 @@ class Frame:
     ) -> 'Frame':
         """A frame; the fixed pattern of its columns is removed unless ``keep_columns``."""
         noise, displayed = pixel_noise(counts), bool(counts[::_ROW_STEP].max() < _LEVELS)
+        pixels = counts if keep_columns else with_columns_corrected(counts.astype(np.float32), noise)
         lag, readout = config.bolometer_lag, config.readout_time
-        image = counts.astype(np.float32)
-        if not keep_columns:
-            image = with_columns_corrected(image, noise)
-        saturation = Saturation.of(counts) if displayed else None
-        return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed, saturation, counts)
+        return Frame(stamp_ns, pixels, noise, camera, twist, lag, readout, displayed, counts)
+
+    @cached_property
+    def image(self) -> Float32Array:
+        """The pixels as floating-point numbers: where markers are followed, few of them are looked at."""
+        return self.pixels.astype(np.float32, copy=False)
+
+    @cached_property
+    def saturation(self) -> 'Saturation | None':
+        """Where its gray scale ends; None: nowhere, or raw counts."""
+        return None if self.received is None or not self.displayed else Saturation.of(self.received, *self.ends)
 
     def in_counts(self, counts_of_levels: FloatArray) -> 'Frame':
         """The frame with counts for the gray levels of a picture for a display, by those (256,) of each level.
@@ -101,10 +111,8 @@ class Frame:
         """
         assert self.received is not None
         image = counts_of_levels.astype(np.float32).take(self.received, mode='clip')
-        noise, saturation = pixel_noise(image), self.saturation
-        if saturation is not None:
-            saturation = saturation._replace(low=counts_of_levels[0], high=counts_of_levels[-1])
-        return replace(self, image=with_columns_corrected(image, noise), noise=noise, saturation=saturation)
+        noise, ends = pixel_noise(image), (counts_of_levels[0], counts_of_levels[-1])
+        return replace(self, pixels=with_columns_corrected(image, noise), noise=noise, ends=ends)
 
 
 class Saturation(NamedTuple):
@@ -117,12 +125,11 @@ class Saturation(NamedTuple):
     high: float
 
     @staticmethod
-    def of(levels: Counts | Gray) -> 'Saturation | None':
+    def of(levels: Counts | Gray, low: float, high: float) -> 'Saturation | None':
         """Of a picture of gray ``levels`` (height, width); None: it is neither black nor white anywhere."""
-        black, white = levels == 0, levels == _LEVELS - 1
-        if not (black.any() or white.any()):
+        if levels.min() > 0 and levels.max() < _LEVELS - 1:
             return None
-        return Saturation(np.subtract(white, black, dtype=np.float32), 0.0, _LEVELS - 1.0)
+        return Saturation(_SIGNS.take(levels, mode='clip'), low, high)
 
     def at(self, places: Float32Array) -> Float32Array:
         """Signs (...) at places (2, ...) in the image, 0 where no neighbour is saturated."""
@@ -188,7 +195,7 @@ def rolling_displacement(
     return np.asarray(later * (flow @ twist.value - (frame.lag - 0.5 * later) * (flow @ twist.acceleration)))
 
 
-def counts_of(pixel: IntArray, image: Float32Array, to_tails: FloatArray | None = None) -> Float32Array:
+def counts_of(pixel: IntArray, image: Counts | Gray | Float32Array, to_tails: FloatArray | None = None) -> Float32Array:
     """Counts (M, C, 4 N, m) at the indices ``pixel`` of the flat image, lag tails removed; N markers in equal parts.
 
     Only these pixels are corrected, in a fourth of the time of the whole windows around the markers.
@@ -197,7 +204,7 @@ def counts_of(pixel: IntArray, image: Float32Array, to_tails: FloatArray | None 
     ----------
     to_tails : (N, 2, 3) affine maps from pixels to their lag tails; None: nothing is removed
     """
-    counts = image.ravel().take(pixel, mode='clip')
+    counts = image.ravel().take(pixel, mode='clip').astype(np.float32, copy=False)
     if to_tails is None:
         return counts
     width = np.float32(image.shape[1])

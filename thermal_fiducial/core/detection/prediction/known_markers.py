@@ -132,9 +132,14 @@ class KnownMarkers:
         corners = corners_in_map(T_map_marker, self.sizes[self.ids])
         self._corners_and_normals = np.concatenate([corners, T_map_marker[:, None, :3, 2]], axis=1)
 
-    def expected(self, T_camera_map: FloatArray, camera: Camera, min_side_px: float) -> ExpectedMarkers:
-        """Predictions of the markers that are wholly in view, face the camera and are large enough."""
-        rotated = self._corners_and_normals @ T_camera_map[:3, :3].T
+    def expected(
+        self, T_camera_map: FloatArray, camera: Camera, min_side_px: float, without: IntArray
+    ) -> ExpectedMarkers:
+        """Predictions of the markers wholly in view, facing the camera and large enough, except the IDs ``without``."""
+        others = ~among(self.ids, without)
+        if not others.any():
+            return ExpectedMarkers.none()
+        rotated = self._corners_and_normals[others] @ T_camera_map[:3, :3].T
         points, normal = rotated[:, :4] + T_camera_map[:3, 3], rotated[:, 4]
         corners = camera.project(points)
         large = (squared_sides(corners) >= min_side_px**2).all(axis=1)
@@ -142,7 +147,7 @@ class KnownMarkers:
         visible = np.flatnonzero(in_view & large & _faces_camera(points.mean(axis=1), normal))
         points = points[visible]
         x, depth = points[..., :2] / points[..., 2:], points[..., 2]
-        return ExpectedMarkers(self.ids[visible], x, depth, np.zeros(len(visible)))
+        return ExpectedMarkers(self.ids[others][visible], x, depth, np.zeros(len(visible)))
 
     def partially_visible(self, T_camera_map: FloatArray, camera: Camera, without: IntArray) -> PartialMarkers:
         """Markers that face the camera and are partially in view, except the IDs ``without``."""
