@@ -4,7 +4,7 @@ import numpy as np
 from support.scenes import motion_prior
 
 from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers
-from thermal_fiducial.core.detection.prediction.tracking import MotionTrack, predict_frame
+from thermal_fiducial.core.detection.prediction.tracking import MeasuredCorners, MotionTrack, predict_frame
 from thermal_fiducial.core.detection.prediction.twist import interaction, Twist, twist_by_odometry
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -72,7 +72,7 @@ def test_tracker_finds_the_twist_from_two_frames():
     x = [p[..., :2] / p[..., 2:] for p in (points, later)]
     tracker = tracker.after(10**9, None, ExpectedMarkers(ids, x[0], points[..., 2], np.full(5, 100.0)))
     assert tracker.predict(10**9 + 10**10) is None
-    found = tracker.correct(10**9 + round(dt * 1e9), None, ids, x[1], later[..., 2], np.full(5, 1e-5))
+    found = tracker.correct(10**9 + round(dt * 1e9), None, MeasuredCorners(ids, x[1], later[..., 2], np.full(5, 1e-5)))
     # A finite step of a thirtieth of a second differs from the derivative in second order; the prior pulls a little.
     np.testing.assert_allclose(found.value, TWIST, atol=0.03)
     assert np.all(np.linalg.eigvalsh(found.covariance) > 0)
@@ -97,7 +97,7 @@ def turning(stamp_ns, states, jitter_ns=0, seed=6):
         seen = points @ se3.so3_exp(0.5 * acceleration * (seen_ns * 1e-9) ** 2)
         x = seen[..., :2] / seen[..., 2:]
         predicted = twist_by_odometry(stamp, heard, np.eye(6), LAG, 0.0) if states else tracker.predict(stamp)
-        twist = tracker.correct(stamp, predicted, ids, x, seen[..., 2], np.full(5, 1e-5))
+        twist = tracker.correct(stamp, predicted, MeasuredCorners(ids, x, seen[..., 2], np.full(5, 1e-5)))
         tracker = tracker.after(stamp, twist, ExpectedMarkers(ids, x, seen[..., 2], np.full(5, 100.0)))
         yield twist, acceleration * (at - LAG)
 
@@ -170,12 +170,13 @@ def test_what_moves_as_predicted_is_the_marker_of_the_last_frame():
     later[1, :, 0] += 0.004
     later[2, :, 1] += 0.03
     ids = np.array([0, 1, 2, 7])
-    explained = tracker.explains(round(dt * 1e9), twist, ids, later, depth, np.full(4, 1e-4))
+    corners = MeasuredCorners(ids, later, depth, np.full(4, 1e-4))
+    explained = tracker.explains(round(dt * 1e9), twist, corners)
     assert explained.tolist() == [True, True, False, False]
     # Without a predicted twist, a brisk flight explains all; after a long time nothing is.
-    any_twist = tracker.explains(round(dt * 1e9), None, ids, later, depth, np.full(4, 1e-4))
+    any_twist = tracker.explains(round(dt * 1e9), None, corners)
     assert any_twist.tolist() == [True, True, True, False]
-    assert not tracker.explains(10**9, twist, ids, later, depth, np.full(4, 1e-4)).any()
+    assert not tracker.explains(10**9, twist, corners).any()
 
 
 def test_a_late_frame_disturbs_nothing_and_a_clock_set_back_is_followed():

@@ -34,7 +34,7 @@ from thermal_fiducial.core.detection.prediction.frame import (
     rolling_displacement,
 )
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
-from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
+from thermal_fiducial.core.detection.prediction.tracking import MeasuredCorners, MotionTrack
 from thermal_fiducial.core.detection.prediction.twist import Twist, UNKNOWN_TWIST
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.reprojection import sides_px
@@ -210,12 +210,12 @@ def _at_stamp(
     # its corners are corrected for lag, those of the last frame are not.
     twist = known
     if frame.twist is not None or known is None:
-        sure = np.ones(len(ids), dtype=bool)
+        measured = MeasuredCorners(ids, at.x, places.depth, deviation)
         if frame.displayed:
             # What looks like a small marker may be another thing, unless it has moved as the last frame's should have.
-            sure = refined.evident | ~refined.small
-            sure |= track.explains(frame.stamp_ns, frame.twist, ids, at.x, places.depth, deviation)
-        twist = track.correct(frame.stamp_ns, frame.twist, ids[sure], at.x[sure], places.depth[sure], deviation[sure])
+            sure = refined.evident | ~refined.small | track.explains(frame.stamp_ns, frame.twist, measured)
+            measured = measured.only(sure)
+        twist = track.correct(frame.stamp_ns, frame.twist, measured)
     if twist is None:
         unsure = doubted + _of_unpredicted_motion(frame, places, refined, UNKNOWN_TWIST, cells)
         return RefinedMarkers(

@@ -22,7 +22,7 @@ from thermal_fiducial.core.detection.prediction.twist import (
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import twist_transfer
 from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS, Stacked
 
 # Longest time between frames whose motion is related [ns].
 _STALE_NS = 150_000_000
@@ -38,6 +38,24 @@ _SIGMAS = 3.0
 _LAGS_BEFORE, _STATES, _SHORTEST_LAG_NS = 3, 10, 5_000_000
 # Fewest states of that, since the noise of a gyroscope averages out; else those of so long before the frame [ns].
 _FEWEST, _LONGEST_NS = 4, 100_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredCorners(Stacked):
+    """Corners of N markers in a frame, by which the camera's motion since the last one is measured.
+
+    Parameters
+    ----------
+    ids : (N,)
+    x : (N, 4, 2) normalised corners: without the displacement by lag if a twist is predicted, else as observed
+    depth : (N, 4) [m]
+    noise : (N,) standard deviation of a corner in normalised coordinates
+    """
+
+    ids: IntArray
+    x: FloatArray
+    depth: FloatArray
+    noise: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,35 +97,20 @@ class MotionTrack:
         depth = np.maximum(points[..., 2], LEAST_DEPTH)
         return ExpectedMarkers(self.markers.ids, points[..., :2] / depth[..., None], depth, self.markers.cnr)
 
-    def correct(
-        self,
-        stamp_ns: int,
-        predicted: Twist | None,
-        ids: IntArray,
-        x: FloatArray,
-        depth: FloatArray,
-        noise: FloatArray,
-    ) -> Twist | None:
-        """Twist corrected by the displacement of corners since the last frame.
-
-        Parameters
-        ----------
-        ids : (N,)
-        x : (N, 4, 2) normalised corners: without the displacement by lag if a twist is predicted, else as observed
-        depth : (N, 4) [m]
-        noise : (N,) standard deviation of a corner in normalised coordinates
-        """
-        now, before = np.nonzero(ids[:, None] == self.markers.ids)
+    def correct(self, stamp_ns: int, predicted: Twist | None, corners: MeasuredCorners) -> Twist | None:
+        """Twist corrected by the displacement of corners since the last frame."""
+        now, before = np.nonzero(corners.ids[:, None] == self.markers.ids)
         dt = self._since(stamp_ns)
         if len(now) == 0 or dt is None:
             return predicted
         begin, end = dt + (self.lag if self.twist is None else 0.0), self.lag if predicted is None else 0.0
         seconds, start = begin - end, predicted or UNKNOWN_TWIST
-        A = interaction(0.5 * (x[now] + self.markers.x[before]), depth[now]).reshape(-1, 6)
-        velocity = (x[now] - self.markers.x[before]).reshape(-1) / seconds
+        x, x_before = corners.x[now], self.markers.x[before]
+        A = interaction(0.5 * (x + x_before), corners.depth[now]).reshape(-1, 6)
+        velocity = (x - x_before).reshape(-1) / seconds
         # Jitter of both stamps scales all velocities of a frame by a common factor.
         stretch = A @ (math.sqrt(2.0) * _JITTER_S / seconds * start.value)
-        weight = np.repeat((seconds / (1.5 * noise[now])) ** 2, _COORDINATES)
+        weight = np.repeat((seconds / (1.5 * corners.noise[now])) ** 2, _COORDINATES)
         # Weighted least squares whose residuals have one common error: the Sherman-Morrison formula.
         weighted, stretched = A.T * weight, weight * stretch
         spread = weighted @ stretch
@@ -117,30 +120,23 @@ class MotionTrack:
         value = weighted @ velocity - share * (stretched @ velocity)
         return corrected(start, information, value, later, later + self.lag)
 
-    def explains(
-        self,
-        stamp_ns: int,
-        predicted: Twist | None,
-        ids: IntArray,
-        x: FloatArray,
-        depth: FloatArray,
-        noise: FloatArray,
-    ) -> BoolArray:
-        """Which markers (N,) were in the last frame, and have moved since as the twist allows; as in :meth:`correct`.
+    def explains(self, stamp_ns: int, predicted: Twist | None, corners: MeasuredCorners) -> BoolArray:
+        """Which markers (N,) were in the last frame, and have moved since as the twist allows.
 
         Their centres are within three standard deviations of where its covariance and the jitter of stamps allow.
         """
-        explained = np.zeros(len(ids), dtype=np.bool_)
-        now, before = np.nonzero(ids[:, None] == self.markers.ids)
+        explained = np.zeros(len(corners.ids), dtype=np.bool_)
+        now, before = np.nonzero(corners.ids[:, None] == self.markers.ids)
         dt = self._since(stamp_ns)
         if dt is None:
             return explained
         twist = predicted or UNKNOWN_TWIST
-        A = dt * interaction(0.5 * (x[now] + self.markers.x[before]), depth[now]).mean(axis=1)
-        moved = (x[now] - self.markers.x[before]).mean(axis=1)
+        x, x_before = corners.x[now], self.markers.x[before]
+        A = dt * interaction(0.5 * (x + x_before), corners.depth[now]).mean(axis=1)
+        moved = (x - x_before).mean(axis=1)
         off, jitter = moved - A @ twist.ago(0.5 * dt), math.sqrt(2.0) * _JITTER_S / dt * moved
         S = A @ twist.covariance @ A.swapaxes(1, 2) + jitter[:, :, None] * jitter[:, None]
-        S += noise[now, None, None] ** 2 * np.eye(2)
+        S += corners.noise[now, None, None] ** 2 * np.eye(2)
         explained[now] = (off * np.linalg.solve(S, off[..., None])[..., 0]).sum(axis=1) < _SIGMAS**2
         return explained
 
