@@ -28,6 +28,7 @@ from thermal_fiducial.files.dictionary import not_in_dictionary
 from thermal_fiducial.files.map_format import read_document, upgraded
 from thermal_fiducial.files.marker_map import dump_map, load_map
 from thermal_fiducial.files.packages import require_plots
+from thermal_fiducial.files.reading import naming
 from thermal_fiducial.map_tools import map_editing
 
 #: What the actions that add markers take for the side of one where nothing is said.
@@ -240,7 +241,9 @@ def _merge(args: argparse.Namespace) -> int:
 
 def _anchor(args: argparse.Namespace) -> int:
     surveyed = _survey(args.survey)
-    _, distances = map_editing.anchor(_load(args), surveyed)
+    marker_map = _load(args)
+    with naming(args.survey):
+        _, distances = map_editing.anchor(marker_map, surveyed)
     for key, distance in distances.items():
         print(f'marker {key}: {1e3 * distance:.1f} mm from its surveyed place')
 

@@ -46,9 +46,10 @@ def write(drawing: Drawing, path: str | os.PathLike[str], paper: str | None = No
         raise InputError(f'{path}: drawings are written as {", ".join(FORMATS)}')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise InputError(f'{path.parent}: is a file, not a folder') from None
     except OSError as error:
-        place = path.parent if path.parent.is_file() else path
-        raise InputError(f'{place}: {error.strerror or error}') from None
+        raise InputError(f'{path}: {error.strerror or error}') from None
     with new_file(path) as new:
         if kind == 'pdf':
             write_pdf(drawing, new, {layer: colour for layer, (_, colour) in LAYERS.items()}, paper)

@@ -9,6 +9,7 @@ from thermal_fiducial.core.geometry.reprojection import corners_in_map, lever_ar
 from thermal_fiducial.core.geometry.se3 import apply, rigid_alignment
 from thermal_fiducial.core.mapping.map_data import align, Alignment, MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 
 
@@ -148,7 +149,7 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[M
     """
     common = sorted(marker_map.markers.keys() & surveyed.keys())
     if len(common) < 3:
-        raise InputError(f'{len(common)} surveyed markers are in the map: three are needed')
+        raise InputError(f'{number_of(len(common), "surveyed marker")} in the map: three are needed')
     target = np.stack([surveyed[key] for key in common])
     source = np.stack([marker_map.markers[key].T_map_marker[:3, 3] for key in common])
     extents = np.linalg.svd(target - target.mean(axis=0), compute_uv=False)

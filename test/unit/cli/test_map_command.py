@@ -209,6 +209,13 @@ def test_a_survey_that_leaves_a_rotation_open_is_refused(path, survey, capsys):
     assert path.read_bytes() == before
 
 
+def test_a_survey_of_too_few_markers_is_named(path, capsys):
+    survey = path.with_name('survey.csv')
+    survey.write_text('id,x,y,z\n0,0,0,1\n900,1,0,1\n901,0,1,1\n')
+    assert run('anchor', path, survey) == 2
+    assert f'{survey}: 1 surveyed marker in the map: three are needed' in capsys.readouterr().err
+
+
 def test_a_survey_that_has_a_marker_twice_is_refused(path, capsys):
     survey, before = path.with_name('survey.csv'), path.read_bytes()
     survey.write_text('0,0,0,1\n3,1,0,1\n5,0,1,1\n0,0,5,1\n')

@@ -490,7 +490,7 @@ def test_sizes_in_metres_and_a_file_in_the_place_of_the_folder_are_named(tmp_pat
         assert f"argument --size: '{size}' is not a number from 0 to 10000 mm" in capsys.readouterr().err
     (tmp_path / 'file').write_text('')
     assert main(['markers', 'make', '--ids', '1', '--out', str(tmp_path / 'file')]) == 2
-    assert f'{tmp_path}/file: File exists' in capsys.readouterr().err
+    assert f'{tmp_path}/file: is a file, not a folder' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
