@@ -67,6 +67,10 @@ INCONSISTENT_PX = 0.3
 WHITE_PX = 0.5
 
 
+#: Covariance of an unknown acceleration of robot and camera in a brisk flight: 3 m/s^2, 4 rad/s^2.
+UNKNOWN_ACCELERATION = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2
+
+
 #: Joint draws of the errors of a map: standard deviations by 64 are accurate to a tenth, those by the lens exact.
 DRAWS = 64
 #: Those of a marker whose place is known exactly.
@@ -98,6 +102,11 @@ def covariance_of_one_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
         possible poses
     """
     return np.asarray(std**2 * np.outer(moved, moved))
+
+
+def covariance_of_motion(twist_covariance: FloatArray, seconds: float) -> FloatArray:
+    """Covariance (6, 6) of the displacement in ``seconds`` [s] by a twist (6, 6), while the acceleration is unknown."""
+    return np.asarray(seconds**2 * twist_covariance + 0.25 * seconds**4 * UNKNOWN_ACCELERATION)
 
 
 # The map, from a joint adjustment.

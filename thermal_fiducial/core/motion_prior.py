@@ -15,7 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import covariance_of_one_error, nearest_semidefinite
+from thermal_fiducial.core.error_model import (
+    covariance_of_motion,
+    covariance_of_one_error,
+    nearest_semidefinite,
+)
 from thermal_fiducial.core.geometry.reprojection import lever_arm, turned
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import CameraPose, Odometry
@@ -25,8 +29,6 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 FASTEST = 50.0
 #: Longest time [s] over which the mapper extrapolates an odometry state to a frame.
 MAX_AGE = 0.3
-#: Covariance (6, 6) of an unknown acceleration of a brisk flight: 3 m/s^2, 4 rad/s^2.
-UNKNOWN_ACCELERATION: FloatArray = np.diag(np.repeat((3.0, 4.0), 3)) ** 2
 # A stamp farther back [ns] is not of a message that was overtaken: the clock was set, and all before is of another one.
 _REORDERED_NS = 100_000_000
 # Largest delay of frames, for which states are kept [ns].
@@ -146,13 +148,13 @@ def extrapolated(
 ) -> PredictedCamera:
     """The camera at a frame that is ``dt`` [s] after a state of the odometry, by clocks known to ``clock_std`` [s].
 
-    The covariance has the error of the twist during that time, and what an unknown acceleration may have changed.
+    Its covariance contains what the twist and an unknown acceleration add in that time.
     """
     step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
     T_map_body = odometry.T_map_body @ step
     R, J = T_map_body[:3, :3], lever_arm(T_map_body[:3, :3] @ T_body_camera[:3, 3])
-    moved = dt**2 * turned(odometry.twist_covariance, R) + 0.25 * dt**4 * UNKNOWN_ACCELERATION
-    covariance = J @ (odometry.pose_covariance + moved) @ J.T
+    of_step = turned(covariance_of_motion(odometry.twist_covariance, dt), R)
+    covariance = J @ (odometry.pose_covariance + of_step) @ J.T
     velocity = J @ np.concatenate([R @ odometry.velocity_body, R @ odometry.angular_velocity_body])
     covariance += covariance_of_one_error(velocity, clock_std)
     return PredictedCamera(CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), odometry, velocity)

@@ -9,6 +9,7 @@ from support.walls import flight, stamp
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import extrapolated, predicted_camera
 
@@ -55,3 +56,17 @@ def test_the_covariance_of_an_extrapolated_camera_has_what_motion_may_have_chang
         squares.append(error @ np.linalg.solve(camera.covariance, error) / 6.0)
     # one where the claim is right; a smooth flight has less acceleration than a brisk one may have
     assert np.mean(squares) < 1.0
+
+
+def test_odometry_that_is_late_says_less_of_the_frame():
+    """A robot at rest begins to move, and odometry stays 0.2 s behind: the IMU is late, or the filter stalls."""
+    seconds, begun = 0.2, np.array([2.0, 0.0, 0.0, 0.0, 0.0, 2.0])
+    still = Odometry(stamp(0), np.eye(4), np.zeros(3), np.zeros(3), 1e-6 * np.eye(6), 1e-4 * np.eye(6))
+    moved = 0.5 * seconds**2 * begun
+    frame = stamp(0) + round(seconds * 1e9)
+    predicted = predicted_camera(motion_prior(still), frame, np.eye(4), time_offset_std=0.0).pose
+    error = difference(predicted.T_map_camera, transform(so3_exp(moved[3:]), moved[:3]))
+    # Two thirds of the linear acceleration that is allowed for, half of the angular one; without allowance it is 3200.
+    allowed_for = (2.0 / 3.0) ** 2 + (2.0 / 4.0) ** 2
+    # What the state itself claims adds 2 %.
+    np.testing.assert_allclose(error @ np.linalg.solve(predicted.covariance, error), allowed_for, rtol=0.02)

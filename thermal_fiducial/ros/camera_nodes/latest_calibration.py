@@ -16,7 +16,7 @@ class LatestCalibration:
 
     Parameters
     ----------
-    node : whose remarks tell of a calibration that is doubted
+    node : warns of doubtful calibrations and changes
     name : of the second camera; empty: the first
     """
 

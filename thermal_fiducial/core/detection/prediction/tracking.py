@@ -14,11 +14,11 @@ from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMar
 from thermal_fiducial.core.detection.prediction.twist import (
     corrected,
     interaction,
-    RANDOM,
     Twist,
     twist_by_odometry,
     UNKNOWN_TWIST,
 )
+from thermal_fiducial.core.error_model import UNKNOWN_ACCELERATION
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import twist_transfer
 from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
@@ -84,7 +84,7 @@ class MotionTrack:
         saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_NS
         if self.twist is None or dt is None or not saw_lately:
             return None
-        return Twist(self.twist.ago(-dt), self.twist.covariance + dt**2 * RANDOM, self.twist.acceleration)
+        return Twist(self.twist.ago(-dt), self.twist.covariance + dt**2 * UNKNOWN_ACCELERATION, self.twist.acceleration)
 
     def expected(self, stamp_ns: int, twist: Twist) -> ExpectedMarkers:
         """The last frame's markers, predicted at this frame."""
@@ -153,7 +153,7 @@ class MotionTrack:
         if twist is not None and self.twist is not None and dt is not None:
             # As far as it exceeds the noise of both.
             noise = (twist.covariance.diagonal() + self.twist.covariance.diagonal()) / dt**2
-            share = RANDOM.diagonal() / (RANDOM.diagonal() + noise)
+            share = UNKNOWN_ACCELERATION.diagonal() / (UNKNOWN_ACCELERATION.diagonal() + noise)
             acceleration = share * (twist.value - self.twist.value) / dt
         if twist is not None:
             twist = replace(twist, acceleration=acceleration)

@@ -10,14 +10,12 @@ import math
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import UNKNOWN_ACCELERATION
 from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.core.motion_prior import UNKNOWN_ACCELERATION
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: Covariance of an unknown acceleration.
-RANDOM = UNKNOWN_ACCELERATION
 # Covariance of the acceleration by odometry, which changes between its states, for each second that they span.
-_CHANGES = 4.0 * RANDOM
+_CHANGES = 4.0 * UNKNOWN_ACCELERATION
 # Least covariance of a twist [m^2/s^2, rad^2/s^2].
 _LEAST = 1e-6 * np.eye(6)
 _EYE = np.eye(6)
@@ -37,7 +35,7 @@ class Twist:
     value: FloatArray
     covariance: FloatArray
     acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
-    acceleration_covariance: FloatArray = field(default_factory=lambda: RANDOM)
+    acceleration_covariance: FloatArray = field(default_factory=lambda: UNKNOWN_ACCELERATION)
 
     def ago(self, seconds: float) -> FloatArray:
         """Twist (6,) the given ``seconds`` before the stamp."""
@@ -81,12 +79,13 @@ def twist_by_odometry(
     typical = np.asarray(sum(state.twist_covariance for state in odometry) / len(t))
     noise = _LEAST.copy()
     noise[3:, 3:] += transfer[3:, 3:] @ typical[3:, 3:] @ transfer[3:, 3:].T
-    # Of few or noisy states the acceleration is hardly known: its prior is RANDOM.
-    known = float(off @ off) + noise.diagonal() / RANDOM.diagonal()
+    # Of few or noisy states the acceleration is hardly known: its prior is UNKNOWN_ACCELERATION.
+    known = float(off @ off) + noise.diagonal() / UNKNOWN_ACCELERATION.diagonal()
     acceleration, unsure = off @ values / known, noise / known + float(t[-1] - t[0]) * _CHANGES
     # In all coordinates, as the rate's noise is in the velocity of a camera with a lever arm, too.
     averaged = transfer * ([1.0] * 3 + [1.0 / math.sqrt(len(t))] * 3)
-    covariance = averaged @ typical @ averaged.T + (middle + lag) ** 2 * unsure + clock_std_s**2 * RANDOM + _LEAST
+    covariance = averaged @ typical @ averaged.T + (middle + lag) ** 2 * unsure + _LEAST
+    covariance += clock_std_s**2 * UNKNOWN_ACCELERATION
     return Twist(values.sum(axis=0) / len(t) - middle * acceleration, covariance, acceleration, unsure)
 
 
