@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from thermal_fiducial.calibration.lens_fit import camera_parameters, LensFit, MATRIX
+from thermal_fiducial.calibration.lens_fit import LensFit
+from thermal_fiducial.calibration.lens_parameters import camera_parameters, MATRIX
 from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, MODELS

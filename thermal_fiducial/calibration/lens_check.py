@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from thermal_fiducial.calibration.lens_fit import by_parameters
+from thermal_fiducial.calibration.lens_parameters import by_parameters
 from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera

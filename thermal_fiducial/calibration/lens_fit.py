@@ -2,13 +2,22 @@
 
 The residuals use the package's own camera model, so the estimate is consistent with its use. Distortion coefficients
 have a prior that limits the displacement of the image's corner relative to its distance from the centre. It is too weak
-to matter where views reach the corner, and constrains what they do not determine.
+to matter where views reach the corner, and constrains what they do not determine. What is claimed where no view
+reaches follows from real lenses instead (:func:`lens_prior`).
 """
 
 from collections.abc import Sequence
 
 import numpy as np
 
+from thermal_fiducial.calibration.lens_parameters import (
+    by_parameters,
+    camera_parameters,
+    lens_prior,
+    MATRIX,
+    prior_sigmas,
+    with_parameters,
+)
 from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -16,8 +25,6 @@ from thermal_fiducial.core.types import FloatArray, IntArray
 
 # Huber threshold [standard deviations].
 _HUBER = 3.0
-# Step of the numerical derivative by the distortion coefficients, which are of order 0.01 to 1.
-_STEP = 1e-6
 _MAX_STEPS = 60
 # Relative decrease of the cost at convergence; damping at which the fit gives up.
 _CONVERGED, _MOST_DAMPED = 1e-7, 1e9
@@ -29,24 +36,6 @@ _ROUNDS, _SETTLED_PX = 4, 1e-4
 _ANGLE = np.pi / 6.0
 _TURNS = np.arange(12) * _ANGLE
 _CIRCLE = np.sqrt(3.0 / (2.0 + np.cos(_ANGLE))) * np.stack([np.cos(_TURNS), np.sin(_TURNS), 0.0 * _TURNS], axis=1)
-# Shares of the distance from the centre by which the first radial term, a higher one and the tangential terms may move
-# the image's corner (standard deviations): lenses of 40 to 100 degrees have up to 0.3, 0.07 and 0.005.
-_FIRST, _HIGHER, _TANGENTIAL = 0.3, 0.1, 0.02
-#: Number of fx fy cx cy, which come before the coefficients.
-MATRIX = 4
-
-
-def prior_sigmas(camera: Camera) -> FloatArray:
-    """Standard deviations about zero of the distortion coefficients (D,), then of decentring that the model lacks."""
-    last = np.array([camera.width, camera.height]) - 1.0
-    focal = np.array([camera.K[0, 0], camera.K[1, 1]])
-    reach = float(np.linalg.norm(np.maximum(camera.principal_point, last - camera.principal_point) / focal))
-    if camera.model == 'equidistant':
-        radial = np.array([_FIRST, _HIGHER, _HIGHER, _HIGHER]) / reach ** np.array([2, 4, 6, 8])
-        return np.asarray(np.append(radial, [_TANGENTIAL / reach] * 2))
-    sigmas = np.array([_FIRST, _HIGHER, _TANGENTIAL, _TANGENTIAL, _HIGHER, _FIRST, _HIGHER, _HIGHER])
-    powers = np.array([2, 4, 1, 1, 6, 2, 4, 6])
-    return np.asarray((sigmas / reach**powers)[: len(camera.D)])
 
 
 class LensFit:
@@ -105,7 +94,8 @@ class LensFit:
     def covariance(self, camera: Camera, T: FloatArray) -> FloatArray:
         """Covariance of fx fy cx cy, all coefficients, held ones too, and decentring that the model lacks.
 
-        It has two parts: the noise of the residuals, and the change by the step to the solution with all of them free.
+        It has two parts: the noise of the residuals, and the change by the step to the solution with all of them free,
+        as far as :func:`lens_prior` lets them.
         Held-out views do not show a gain below some per cent; a coefficient of five standard deviations may gain less.
         """
         free, self._free = self._free, np.arange(len(self._prior))
@@ -113,10 +103,12 @@ class LensFit:
         information, _ = self._normal_equations(camera, T, error, np.inf, 0.0)
         variance = float(np.sum(error**2)) / max(1, error.size - len(information))
         count = len(self._prior)
-        information[range(count), range(count)] += variance * self._prior
+        to_prior, known = lens_prior(camera)
+        information[MATRIX:count, MATRIX:count] += variance * known
         scale = np.sqrt(np.diag(information)) + 1e-12
         inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
-        _, gradient = self._normal_equations(camera, T, error, _HUBER * _noise(error), float(np.sqrt(variance)))
+        _, gradient = self._normal_equations(camera, T, error, _HUBER * _noise(error), 0.0)
+        gradient[MATRIX:count] -= variance * known @ to_prior
         change = (inverse @ gradient)[:count]
         self._free = free
         return np.asarray(variance * inverse[:count, :count] + np.outer(change, change))
@@ -141,7 +133,7 @@ class LensFit:
         if shared:
             parameters = camera_parameters(camera)
             parameters[self._free] += step[:shared]
-            camera = _with_parameters(camera, parameters)
+            camera = with_parameters(camera, parameters)
         turn = step[shared:].reshape(-1, 6)
         return camera, se3.transform(se3.so3_exp(turn[:, 3:]) @ T[:, :3, :3], T[:, :3, 3] + turn[:, :3])
 
@@ -224,50 +216,6 @@ class LensFit:
 def _noise(error: FloatArray) -> float:
     """Standard deviation of a coordinate, from the median; at least a hundredth of a pixel."""
     return max(1.4826 * float(np.median(np.abs(error))), 0.01)
-
-
-def camera_parameters(camera: Camera) -> FloatArray:
-    """Values of fx fy cx cy and the distortion coefficients."""
-    K = camera.K
-    return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera.D])
-
-
-def by_parameters(camera: Camera, points: FloatArray, chosen: IntArray | None = None) -> FloatArray:
-    """Derivative (N, 2, K) of the pixels of points (N, 3) by the ``chosen`` of all parameters; None: by each of them.
-
-    These are fx fy cx cy, the coefficients, and where the model has no tangential ones two that would decentre it.
-    """
-    x = points[:, :2] / points[:, 2:]
-    parameters = camera_parameters(camera)
-    chosen = np.arange(MATRIX + len(prior_sigmas(camera))) if chosen is None else chosen
-    J = np.zeros((len(points), 2, len(chosen)))
-    focal = np.array([camera.K[0, 0], camera.K[1, 1]])
-    distorted = (camera.distort(x) - camera.principal_point) / focal
-    for place, index in enumerate(chosen.tolist()):
-        if index < MATRIX:
-            J[:, index % 2, place] = distorted[:, index] if index < 2 else 1.0
-            continue
-        if index >= len(parameters):
-            J[:, :, place] = focal * _decentred(distorted, index - len(parameters))
-            continue
-        step = np.zeros(len(parameters))
-        step[index] = _STEP
-        # Without the check for points outside the lens's field, which costs more than the projection.
-        ahead, behind = (_with_parameters(camera, parameters + sign * step).distort(x) for sign in (1.0, -1.0))
-        J[:, :, place] = (ahead - behind) / (2.0 * _STEP)
-    return J
-
-
-def _decentred(x: FloatArray, axis: int) -> FloatArray:
-    """Displacement (N, 2) of directions (N, 2) by a unit of tangential distortion (D. C. Brown, 1966)."""
-    mixed, along = 2.0 * x[:, 0] * x[:, 1], np.sum(x * x, axis=1) + 2.0 * x[:, 1 - axis] ** 2
-    return np.stack([mixed, along] if axis == 0 else [along, mixed], axis=1)
-
-
-def _with_parameters(camera: Camera, parameters: FloatArray) -> Camera:
-    fx, fy, cx, cy = parameters[:MATRIX]
-    K = np.array([[max(fx, 1.0), 0.0, cx], [0.0, max(fy, 1.0), cy], [0.0, 0.0, 1.0]])
-    return Camera(camera.width, camera.height, K, camera.model, parameters[MATRIX:])
 
 
 def _in_camera(T: FloatArray, points: FloatArray) -> FloatArray:

@@ -165,9 +165,9 @@ def test_views_in_the_middle_do_not_determine_the_corners(name):
     assert error.covered_share < 0.12
     # Three standard deviations, in the middle and at the corners alike.
     assert np.all(off < 3.0 * error.sigma_px.ravel() + 0.01)
-    # And not so wide that it says nothing: a fifth of the distance to the corner.
+    # And not so wide that it says nothing: at the corners errors are 1 to 8 px, and claims were 30 to 65 px.
     assert off[~inside].max() > 0.4
-    assert error.outside_px < 85.0
+    assert error.outside_px < 12.0
 
 
 def lens_rays(lens, uv):
