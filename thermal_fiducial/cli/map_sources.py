@@ -3,7 +3,7 @@
 import argparse
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 import re
 import sys
@@ -14,7 +14,12 @@ from thermal_fiducial.cli.map_photos import detect_in_photos, isotropic, photos_
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.run_parameters import camera_of_run, dictionary_of_run, sizes_of_run
+from thermal_fiducial.cli.run_parameters import (
+    camera_of_run,
+    dictionary_of_run,
+    size_std_of_run,
+    sizes_of_run,
+)
 from thermal_fiducial.cli.subcommands import file_to_write, whole_number
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.detection.detector import rows_from_corners
@@ -109,7 +114,8 @@ def _build(args: argparse.Namespace) -> int:
     if args.origin is not None and not any(args.origin in rows['id'] for rows in frames):
         origin = f'marker {args.origin} of {args.dictionary}'
         raise InputError(f'{args.images}: {origin}, the origin, is in none of the {number_of(len(frames), "photo")}')
-    return _grow(args, frames, camera, start, work, [photo.name for photo in photos])
+    config = _mapper_config(args, start.dictionary)
+    return _grow(frames, camera, start, config, work, [photo.name for photo in photos])
 
 
 def _refine(args: argparse.Namespace) -> int:
@@ -129,7 +135,8 @@ def _refine(args: argparse.Namespace) -> int:
     frames = _read_detections(file, start, args, camera)
     if len(frames) > args.max_frames:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, args.max_frames).astype(int)]
-    return _grow(args, frames, camera, start, work)
+    config = replace(_mapper_config(args, start.dictionary), marker_size_std=size_std_of_run(args.run_folder))
+    return _grow(frames, camera, start, config, work)
 
 
 def _warn_of_other_dictionary(args: argparse.Namespace, start: MarkerMap) -> None:
@@ -145,14 +152,13 @@ def _only_size(marker_map: MarkerMap) -> float | None:
 
 
 def _grow(
-    args: argparse.Namespace,
     frames: list[Markers],
     camera: Camera,
     start: MarkerMap,
+    config: MarkerMapperConfig,
     work: _MapInProgress,
     names: Sequence[str] = (),
 ) -> int:
-    config = _mapper_config(args, start.dictionary)
     with progress_bar('mapping') as progress:
         built = build_map(
             frames, camera, start, config, lambda markers, share: progress(share, number_of(markers, 'marker'))

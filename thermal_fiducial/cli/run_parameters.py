@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from thermal_fiducial.calibration.sources import recorded_camera
+from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
@@ -46,6 +47,12 @@ def sizes_of_run(run: Path) -> tuple[float | None, tuple[str, ...]]:
     size, overrides = (_parameter(run, 'marker_mapper', name) for name in ('marker_size', 'marker_size_overrides'))
     known = isinstance(size, float | int) and isinstance(overrides, list)
     return (float(size), tuple(map(str, overrides))) if known else (None, ())
+
+
+def size_std_of_run(run: Path) -> float:
+    """Relative error of the sides of markers that a run's mapper takes for declared [share]."""
+    std = _parameter(run, 'marker_mapper', 'marker_size_std')
+    return float(std) if isinstance(std, float | int) else MarkerMapperConfig().marker_size_std
 
 
 def dictionary_of_run(run: Path) -> str:
