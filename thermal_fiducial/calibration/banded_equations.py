@@ -52,13 +52,22 @@ class BandedEquations:
 
     def solved(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Steps of the states (N, S) and of the shared unknowns (K,), and the covariance (K, K) of the latter."""
-        flat = self.B.reshape(-1, len(self.c))
-        solved = solveh_banded(_band(self.H), np.column_stack([self.g.ravel(), flat]), lower=True)
-        by_shared = solved[:, 1:]
-        covariance = np.linalg.inv(self.C - flat.T @ by_shared)
-        shared = -covariance @ (self.c - flat.T @ solved[:, 0])
-        own = (-solved[:, 0] - by_shared @ shared).reshape(self.g.shape)
+        steps, by_shared, covariance = self._eliminated(self.g.reshape(-1, 1))
+        shared = -covariance @ (self.c - self.B.reshape(by_shared.shape).T @ steps[:, 0])
+        own = (-steps[:, 0] - by_shared @ shared).reshape(self.g.shape)
         return own, shared, covariance
+
+    def steps_of_shared(self, g: FloatArray, c: FloatArray) -> FloatArray:
+        """Steps (K, k) of the shared unknowns by each of k gradients (N, S, k) and (K, k)."""
+        steps, by_shared, covariance = self._eliminated(g.reshape(self.g.size, c.shape[-1]))
+        return np.asarray(-covariance @ (c - self.B.reshape(by_shared.shape).T @ steps))
+
+    def _eliminated(self, sides: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """States by k right sides (N S, k), by the shared unknowns (N S, K), and the covariance (K, K) of those."""
+        flat = self.B.reshape(-1, len(self.c))
+        solved = solveh_banded(_band(self.H), np.column_stack([sides, flat]), lower=True)
+        by_shared = solved[:, sides.shape[1] :]
+        return solved[:, : sides.shape[1]], by_shared, np.linalg.inv(self.C - flat.T @ by_shared)
 
 
 def _band(H: FloatArray) -> FloatArray:

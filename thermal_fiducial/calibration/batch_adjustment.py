@@ -69,6 +69,7 @@ class Problem:
     imu, noise : samples and their noise densities
     rows, readout : row moments of the frames, and the read-out time assumed in their poses [s]; without rows it is zero
     jitter : standard deviation of the stamps [s]
+    systematic : (N, 6, K) errors of the poses by a standard deviation of each error that all of them share
     """
 
     def __init__(
@@ -81,7 +82,9 @@ class Problem:
         rows: RowMoments | None = None,
         readout: float = 0.0,
         jitter: float = 0.0,
+        systematic: FloatArray | None = None,
     ) -> None:
+        self._systematic = np.zeros((len(stamps), 6, 0)) if systematic is None else systematic
         self._stamps, self._measured, self._root, self._imu, self._noise = stamps, measured, root, imu, noise
         # Averaged, since vibration in the twist would be correlated with that in the prediction.
         self._steady = imu.averaged(float(np.median(np.diff(stamps))))
@@ -110,7 +113,8 @@ class Problem:
         Errors that are correlated over seconds (a lens error in a part of the image, unmodelled IMU errors) are not in
         a covariance that assumes white noise. Delete-a-group jackknife, B. Efron, "The
         jackknife, the bootstrap and other resampling plans", 1982; never narrower than the covariance of white noise.
-        An answer is a step from the whole's solution: further ones change a deviation by less than a hundredth.
+        An answer is a step from the whole's solution: further ones change a deviation by less than a hundredth. What
+        all frames share shows in no scatter, and is added.
         """
         of_samples = self._of_samples(solution.state)
         edges = np.linspace(0, len(self._stamps), _GROUPS + 1).astype(int).tolist()
@@ -119,7 +123,17 @@ class Problem:
         # The direction of gravity is a nuisance parameter.
         variance[7:9] = 0.0
         wider = np.sqrt(np.maximum(1.0, variance / np.diag(solution.covariance)))
-        return replace(solution, covariance=solution.covariance * np.outer(wider, wider))
+        shared = self._steps_by_systematic(solution.state, of_samples)
+        return replace(solution, covariance=solution.covariance * np.outer(wider, wider) + shared @ shared.T)
+
+    def _steps_by_systematic(self, state: State, of_samples: BandedEquations) -> FloatArray:
+        """Steps (25, K) of the shared unknowns by a standard deviation of each error that all poses share."""
+        normal = of_samples.copy()
+        self._add_poses(state, normal)
+        error, own, shared = self.pose_errors(state)
+        root, _ = self._weighted_root(error, shared[:, :, 6])
+        own, shared, off = root @ own, root @ shared, root @ self._systematic
+        return normal.steps_of_shared(np.swapaxes(own, 1, 2) @ off, np.einsum('nes,nek->sk', shared, off))
 
     def _step_without(self, state: State, of_samples: BandedEquations, first: int, last: int) -> FloatArray:
         """Step (25,) of the shared unknowns without the frames from ``first`` to ``last``."""
@@ -206,18 +220,22 @@ class Problem:
         spread = 1.4826 * float(np.median(np.abs(late - np.median(late))))
         return float(np.sqrt(max(0.0, spread**2 - np.median(1.0 / square[fast]))))
 
+    def _weighted_root(self, error: FloatArray, twist: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Root information (N, 6, 6) of poses off by ``error`` (N, 6) with robust weights, and these weights (N, 1)."""
+        root = self._whitening(twist)
+        distance = np.linalg.norm((root @ error[:, :, None])[:, :, 0], axis=1)
+        weight = np.sqrt(np.minimum(1.0, _INLIER / np.maximum(distance, 1e-12)))[:, None]
+        return weight[:, :, None] * root, weight
+
     def _add_poses(self, state: State, normal: BandedEquations) -> None:
         error, own, shared = self.pose_errors(state)
-        root = self._whitening(shared[:, :, 6])
-        e = (root @ error[:, :, None])[:, :, 0]
-        distance = np.linalg.norm(e, axis=1)
-        weight = np.sqrt(np.minimum(1.0, _INLIER / np.maximum(distance, 1e-12)))[:, None]
+        root, weight = self._weighted_root(error, shared[:, :, 6])
         if self._rows is not None:
             twist = weight * shared[:, :, 6]
             information = np.einsum('ni,nij,nj->', twist, self._beyond, twist)
             normal.C[9, 9] += information
             normal.c[9] += information * (state.readout - self._about) - np.sum(weight * twist * self._rows.residual)
-        e, own, shared = weight * e, weight[:, :, None] * (root @ own), weight[:, :, None] * (root @ shared)
+        e, own, shared = (root @ error[:, :, None])[:, :, 0], root @ own, root @ shared
         normal.add_states(slice(None), own, shared, e)
         normal.add_shared(shared, e)
 

@@ -78,6 +78,8 @@ def calibrate_camera_imu(
 ) -> CameraImuCalibration:
     """Estimate the extrinsics from poses, as if all rows were read out at once.
 
+    Poses do not say what they owe to an error of the lens: the covariance is without it.
+
     Parameters
     ----------
     poses : of the camera in the map, stamped by the camera's clock, in order
@@ -126,7 +128,8 @@ def calibrate_rolling_camera_imu(
     sigma = float(np.sqrt(second.covariance[9, 9]))
     if second.state.readout <= _SIGNIFICANT * sigma:
         poses = [frame.pose for frame in at_once]
-        problem, second = recording.solved(poses, shaken, first.jitter, first.state)
+        systematic = [frame.systematic for frame in at_once]
+        problem, second = recording.solved(poses, shaken, first.jitter, first.state, systematic)
         second = problem.repeated(second)
     return _answer(second, sigma)
 
@@ -143,7 +146,8 @@ def _rolling(
     readout = 0.0 if state is None else state.readout
     for _ in range(_ROUNDS):
         poses, rows = [frame.pose for frame in solved], [frame.rows for frame in solved]
-        problem, solution = recording.solved(poses, noise, jitter, state, rows, readout)
+        systematic = [frame.systematic for frame in solved]
+        problem, solution = recording.solved(poses, noise, jitter, state, systematic, rows, readout)
         state = replace(solution.state, readout=max(0.0, solution.state.readout))
         if abs(state.readout - readout) < _SETTLED:
             break
@@ -225,10 +229,15 @@ class _RigRecording:
         noise: Densities,
         jitter: float = 0.0,
         state: State | None = None,
+        systematic: Sequence[FloatArray] | None = None,
         rows: Sequence[RowMoments] | None = None,
         readout: float = 0.0,
     ) -> tuple[Problem, Solution]:
         """The adjustment of all poses, ``rows`` about ``readout``, and its solution, iterated from ``state`` on.
+
+        Parameters
+        ----------
+        systematic : (6, K) of each pose, as :class:`SolvedFrame` has it
 
         Raises
         ------
@@ -238,7 +247,8 @@ class _RigRecording:
         stamps, measured = self._seconds(poses), np.stack([pose.T_map_camera for pose in poses])
         root = np.stack([root_information(pose.covariance) for pose in poses])
         moments = None if rows is None else RowMoments.stacked(rows)
-        problem = Problem(stamps, measured, root, self.imu, noise, moments, readout, jitter)
+        shared = None if systematic is None else np.stack(systematic)
+        problem = Problem(stamps, measured, root, self.imu, noise, moments, readout, jitter, shared)
         if state is None or len(state.p) != len(poses):
             state = first_state(stamps, measured, self.imu, PoseEkfConfig.gravity)
         return problem, problem.solved(state)

@@ -11,13 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.calibration.joint_pose import solve_camera_pose
+from thermal_fiducial.core.error_model import DRAWS, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise, whitening
+from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
 # Mahalanobis distance of a corner beyond which it loses weight, as in the solution of the pose.
 _INLIER = 3.0
+# Errors that all frames of a recording have in common.
+_ERRORS = SystematicErrors()
 
 
 @dataclass(frozen=True)
@@ -80,11 +84,16 @@ class FrameCorners:
         """
         corners = self.corners_px if shift is None else self.corners_px + shift
         pose = solve_camera_pose(corners, self.covariances, self.points, camera, initial)
-        moments = self._moments(camera, pose.T_map_camera, corners)
-        fitted = CameraPose(self.stamp_ns, pose.T_map_camera, pose.covariance, rms_px=pose.rms_px)
-        return SolvedFrame(self, fitted, moments)
+        T_map_camera, covariance = pose.T_map_camera, pose.covariance
+        moments, off = self._moments(camera, T_map_camera, corners)
+        by_size = np.zeros((6, 1))
+        by_size[:3, 0] = _ERRORS.marker_size_std * (T_map_camera[:3, 3] - self.T_map_marker[:, :3, 3].mean(axis=0))
+        systematic = np.concatenate([covariance @ off, by_size], axis=1)
+        fitted = CameraPose(self.stamp_ns, T_map_camera, covariance, rms_px=pose.rms_px)
+        return SolvedFrame(self, fitted, moments, systematic)
 
-    def _moments(self, camera: Camera, T_map_camera: FloatArray, corners: FloatArray) -> RowMoments:
+    def _moments(self, camera: Camera, T_map_camera: FloatArray, corners: FloatArray) -> tuple[RowMoments, FloatArray]:
+        """The moments, and the sums (6, K) J' off over the corners, off by :func:`corner_errors`."""
         count = len(corners)
         poses = np.broadcast_to(T_map_camera, (count, 4, 4))
         predicted, J, _ = linearise(camera, poses, self.T_map_marker, self.sizes)
@@ -93,11 +102,23 @@ class FrameCorners:
         weight = np.minimum(1.0, _INLIER / np.maximum(np.linalg.norm(rho, axis=1), 1e-12))
         J = (W @ J.reshape(count, 4, 2, 6)).reshape(-1, 2, 6) * weight[:, None, None]
         moved = J * self.shares(camera.height).reshape(-1, 1, 1)
-        return RowMoments(
+        moments = RowMoments(
             np.einsum('nij,nik->jk', J, moved),
             np.einsum('nij,nik->jk', moved, moved),
             np.einsum('nij,ni->j', moved, rho * weight[:, None]),
         )
+        off = (W @ corner_errors(self.corners_px, camera)).reshape(-1, 2, DRAWS + 1) * weight[:, None, None]
+        return moments, np.einsum('nij,nik->jk', J, off)
+
+
+def corner_errors(corners: FloatArray, camera: Camera) -> FloatArray:
+    """Errors (N, 4, 2, K) [px] of corners (N, 4, 2) by a standard deviation of each of K of the calibration.
+
+    Of its lens, whose covariance draws have, and of its focal length.
+    """
+    of_lens = LensErrors(corners, camera, _ERRORS).drawn() / np.sqrt(DRAWS)
+    of_focal_length = _ERRORS.focal_length_std * (corners - camera.principal_point)
+    return np.concatenate([of_lens, of_focal_length[..., None]], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -107,3 +128,5 @@ class SolvedFrame:
     corners: FrameCorners
     pose: CameraPose
     rows: RowMoments
+    #: (6, K) errors of the pose by a standard deviation of each systematic error: of lens, focal length, sides
+    systematic: FloatArray
