@@ -127,6 +127,16 @@ MECHANISMS = {
     'stamps off the grid of frames': Mechanism(
         ('small step of clock',), ('camera_clock:FrameGrid',), {'camera_clock:FrameGrid.off_grid': lambda *_: 0}
     ),
+    'start about the learned clock offset': Mechanism(
+        ('shaken start',),
+        ('history:History._relinearise', 'hypotheses:relinearises'),
+        {'history:relinearises': lambda *_: False},
+    ),
+    'second Gauss-Newton step': Mechanism(
+        ('poorly mapped markers',),
+        ('update:_iterated',),
+        {'update:_iterated': lambda innovation, gain: gain @ innovation.value},
+    ),
     'error of the extrinsics': Mechanism(
         ('carpet_mountain', 'carpet_slow_circle'),
         changes={'extrinsics_position_std': 0.0, 'extrinsics_orientation_std': 0.0},

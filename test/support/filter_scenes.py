@@ -16,7 +16,8 @@ from support.flights import config, errors, Flight, in_order, Motion, run_watche
 from support.sim_flights import simulated
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.geometry.se3 import so3_exp
+from thermal_fiducial.core.geometry.reprojection import lever_arm
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 
 Figures = dict[str, float]
@@ -121,6 +122,8 @@ def _at_ends(arrivals: Arrivals, states: list[Any], truth: np.ndarray, counted: 
 # --- flights ------------------------------------------------------------------------------------------------
 
 LATE = 0.03
+#: Errors of poses by several markers.
+WELL_SEEN = {'rotation_std': (3e-3, 3e-3, 1e-3), 'translation_std': (3e-4, 3e-4, 3e-3)}
 
 
 def _arrivals(flight: Flight, poses: list[CameraPose], samples: list[ImuSample] | None = None, **rest: Any) -> Arrivals:
@@ -363,15 +366,51 @@ def map_in_the_making(seed: int) -> Arrivals:
     return _arrivals(flight, poses, gaps=((13.0, 15.0),))
 
 
+def poorly_mapped_markers(seed: int) -> Arrivals:
+    """By turns of two seconds exact markers, and others whose map is off by 0.6 m and 0.1 rad, as their poses claim."""
+    flight, rng = Flight(seed=seed, seconds=16.0, **WELL_SEEN), np.random.default_rng(seed)
+    stds, centre = np.repeat((0.6, 0.1), 3), np.array([3.0, 0.0, 1.0])
+    off, poses = stds * rng.normal(size=6), []
+    for pose in flight.poses:
+        if (pose.stamp_ns - START_NS) // 2_000_000_000 % 2:
+            to_camera = lever_arm(pose.T_map_camera[:3, 3] - centre)
+            of_map = to_camera @ np.diag(stds**2) @ to_camera.T
+            turn = transform(so3_exp(off[3:]), centre + off[:3] - so3_exp(off[3:]) @ centre)
+            pose = replace(
+                pose,
+                T_map_camera=turn @ pose.T_map_camera,
+                covariance=pose.covariance + of_map,
+                map_covariance=of_map,
+            )
+        poses.append(pose)
+    return _arrivals(flight, poses)
+
+
+def shaken_start(seed: int) -> Arrivals:
+    """Begun while shaken by hand, 0.7 m/s and 2 rad/s an axis, with clocks 70 ms apart.
+
+    Of the start itself resets count alone.
+    """
+    rng = np.random.default_rng(300 + seed)
+    phase, frequency = rng.uniform(0.0, 2.0 * np.pi, (2, 3, 2)), rng.uniform(3.0, 6.0, (2, 3, 2))
+    rates = np.array([0.7, 2.0])[:, None, None]
+    motion = Motion(*np.stack([rates / frequency, frequency, phase], axis=-1))
+    flight = Flight(seed=seed, seconds=6.0, motion=motion, offset=-0.07, **WELL_SEEN)
+    return _arrivals(flight, flight.poses)
+
+
 def _scenes() -> dict[str, Scene]:
     flights = (
         brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, starved,
         jittering, tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start, stepping_clock,
-        small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making, shaking_mount,
+        small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making, shaking_mount, poorly_mapped_markers,
+        shaken_start,
     )  # fmt: skip
     scenes: dict[str, Scene] = {scene.__name__.replace('_', ' '): partial(of_flights, scene) for scene in flights}
     # The clock's error over its claim takes more of them.
     scenes['slow and noisy'] = partial(of_flights, slow_and_noisy, seeds=range(8))
+    # One start in five is reset.
+    scenes['shaken start'] = partial(of_flights, shaken_start, seeds=range(8))
     data = os.environ.get('THERMAL_FIDUCIAL_DATA')
     if data and (Path(data) / 'real_flights').is_dir():
         for name in ('cam0', *real_flights.CARPETS):
