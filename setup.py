@@ -33,6 +33,7 @@ setup(
     install_requires=[
         'numpy>=1.26',
         'scipy',
+        # The oldest in CI. Ubuntu's own 4.6 serves too (package.xml); that of pip has no markers.
         'opencv-python-headless>=4.10',
         'filterpy>=2.0.0',
         'pyyaml',

@@ -5,6 +5,7 @@ from functools import cache
 import cv2
 import numpy as np
 import pytest
+from support.opencv import draw_marker
 from support.scenes import camera_of
 
 from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
@@ -75,9 +76,9 @@ def test_a_calibration_of_another_image_size_is_named(detector):
 def test_a_marker_where_the_lens_shows_nothing_is_left_out(detector, focal_px, model, D):
     """In the corners of the image, beyond the hemisphere or the fold of the lens."""
     camera = Camera(640, 512, np.array([[focal_px, 0, 320], [0, focal_px, 256], [0, 0, 1]]), model, D)
-    counts = np.full((512, 640), 8150.0)
+    counts, dictionary = np.full((512, 640), 8150.0), cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     for marker_id, (x, y) in enumerate([(290, 220), (20, 20), (560, 20), (20, 440), (560, 440)]):
-        marker = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), marker_id, 60)
+        marker = draw_marker(dictionary, marker_id, 60)
         counts[y : y + 60, x : x + 60] = np.where(marker > 0, 8150.0, 8000.0)
     counts = cv2.GaussianBlur(counts, (0, 0), 0.7) + np.random.default_rng(0).normal(0.0, 2.0, counts.shape)
     for frame in range(5):
