@@ -27,7 +27,7 @@ from thermal_fiducial.replay.recorder import Recorder
 from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.base.counting import CountingNode
 from thermal_fiducial.ros.base.node import StageNode
-from thermal_fiducial.ros.process.run import initialise, make_executor
+from thermal_fiducial.ros.process.run import initialise, make_executor, OF_A_COMMAND
 
 _KINDS: dict[str, type[StageNode[Any]]] = {
     'tau2_camera': Tau2Camera,
@@ -53,7 +53,7 @@ def replay_lockstep(job: ReplayJob) -> dict[str, Any]:
     """
     context = Context()
     with own_domain() as domain:
-        initialise(['--ros-args', *job.ros_arguments], context, domain)
+        initialise([*OF_A_COMMAND, *job.ros_arguments], context, domain)
         graph = None
         try:
             graph = _Graph(context, job)

@@ -29,7 +29,7 @@ from thermal_fiducial.replay.recorder import Recorder
 from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.base.counting import CountingNode
 from thermal_fiducial.ros.process.promptness import prompt
-from thermal_fiducial.ros.process.run import initialise, make_executor
+from thermal_fiducial.ros.process.run import initialise, make_executor, OF_A_COMMAND
 
 #: Time for the nodes to match among themselves after both ends of each topic are in the graph [s].
 _MATCHING_S = 0.7
@@ -62,7 +62,7 @@ def replay_processes(job: ReplayJob, rate: float, say: Callable[[str], None]) ->
     """
     context = Context()
     with own_domain() as domain:
-        initialise(None, context, domain)
+        initialise(OF_A_COMMAND, context, domain)
         say(f'the nodes run in DDS domain {domain} of this computer: listen with ROS_DOMAIN_ID={domain}')
         try:
             with (

@@ -165,6 +165,23 @@ def test_arguments_that_ros_cannot_read_are_an_input_error(arguments):
 
 
 @pytest.mark.parametrize(
+    ('module', 'arguments', 'status', 'words'),
+    [
+        ('nodes.pose_ekf', [], 2, ': ROS_LOG_DIR names another folder'),
+        ('cli.main', ['watch', '--once', '--wait', '0.1'], 1, ''),
+    ],
+)
+def test_a_home_that_cannot_be_written(module, arguments, status, words):
+    """A node needs a folder for its logs, and names the variable; a command, as replay and watch, needs none."""
+    start = f'import sys; from thermal_fiducial.{module} import main; sys.exit(main())'
+    home = {name: value for name, value in os.environ.items() if name != 'ROS_LOG_DIR'} | {'ROS_HOME': '/proc/nowhere'}
+    ended = subprocess.run([sys.executable, '-c', start, *arguments], env=home, capture_output=True, text=True)
+    assert ended.returncode == status
+    assert words in ended.stderr
+    assert len(ended.stderr.splitlines()) == bool(words)
+
+
+@pytest.mark.parametrize(
     ('keystore', 'enclave', 'words'),
     [
         ('', '/drone', 'ROS_SECURITY_KEYSTORE is not set'),

@@ -56,6 +56,10 @@ def make_executor(context: Context | None = None) -> Any:
     return EventsExecutor(context=context)
 
 
+#: Arguments of what runs for a command and not on a robot: no files in ~/.ros/log, which may not be writable.
+OF_A_COMMAND = ('--ros-args', '--disable-external-lib-logs')
+
+
 def initialise(
     args: Sequence[str] | None,
     context: Context | None = None,
@@ -67,7 +71,7 @@ def initialise(
     Raises
     ------
     InputError
-        Arguments or a parameter file that ROS cannot read.
+        Arguments or a parameter file that ROS cannot read, or no folder for its logs.
     """
     use_transport_profile()
     try:
@@ -80,7 +84,8 @@ def initialise(
     except RuntimeError as error:
         if _is_secured() and not os.environ.get('ROS_SECURITY_KEYSTORE'):
             raise InputError('ROS_SECURITY_ENABLE is true, and ROS_SECURITY_KEYSTORE is not set') from None
-        raise InputError(_first_line(error)) from None
+        hint = ': ROS_LOG_DIR names another folder' if 'log directory' in str(error) else ''
+        raise InputError(_first_line(error) + hint) from None
 
 
 def _is_secured() -> bool:

@@ -7,7 +7,7 @@ from typing import Any
 from rclpy.context import Context
 from rclpy.node import Node
 
-from thermal_fiducial.ros.process.run import initialise, make_executor
+from thermal_fiducial.ros.process.run import initialise, make_executor, OF_A_COMMAND
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def observer(name: str, ros_arguments: Sequence[str], domain_id: int | None) -> 
         Arguments that ROS cannot read.
     """
     context = Context()
-    initialise(['--ros-args', *ros_arguments], context, domain_id)
+    initialise([*OF_A_COMMAND, *ros_arguments], context, domain_id)
     executor = make_executor(context)
     node = Node(name, context=context)
     try:
