@@ -28,6 +28,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._map = MapServices(self, self._publish_jump)
         self.mapper = self._map.mapper
         self._result = MapperResult(0, None, 'no markers yet')
+        self._misfit = map_status.Misfit()
         self._topics = MapTopics(self)
         self._frames = self.subscribe_newest(PointCloud2, 'markers', self._on_markers, qos.RESULT, raw=True)
         self._poses = CameraPoses(self, self.mapper)
@@ -44,6 +45,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     def _on_markers(self, message: bytes) -> None:
         frame = self.mapper.locate(*clouds.stamped_markers(message), self.camera(), self.odometry)
         self._poses.send(frame.stamp_ns, frame.pose)
+        self._misfit.add(frame)
         before, self._result = self._result, self.mapper.learn(frame)
         for marker_id, line in map_status.news(before, self._result).items():
             self.console.event(f'marker {marker_id}', line)
@@ -76,15 +78,15 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     def state(self) -> tuple[bytes, str]:
         """Why the last frame gave no pose, doubts about map and file, quarantined markers, skipped frames."""
         left = self._frames.left_since()
-        return map_status.state(self._result, self._map.doubts, frozen=self.mapper.frozen, left=left)
+        return map_status.state(self._result, self.headline(), frozen=self.mapper.frozen, left=left)
 
     def headline(self) -> str:
-        """Doubts about map and file."""
-        return self._map.doubts
+        """Doubts about map, file and calibration."""
+        return '; '.join(filter(None, (self._map.doubts, self._misfit.doubt)))
 
     def figures(self) -> dict[str, object]:
         """Key-value pairs: size of the map, candidates."""
-        own = map_status.figures(self.mapper.map, self.mapper.resets, self._result)
+        own = map_status.figures(self.mapper.map, self.mapper.resets, self._result, self._misfit.sigma)
         return super().figures() | own | self._poses.figures()
 
 

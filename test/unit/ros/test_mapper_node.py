@@ -1,16 +1,21 @@
 """Node ``marker_mapper``: edits taken over in flight, history, what RViz is shown."""
 
+from dataclasses import replace
+
 from geometry_msgs.msg import TransformStamped
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
-from support.messages import info
+from support import small_bag
+from support.messages import info, START
 from visualization_msgs.msg import Marker, MarkerArray
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.geometry.se3 import apply, so3_exp, transform
+from thermal_fiducial.core.detection.detector import rows_from_corners
+from thermal_fiducial.core.geometry.reprojection import corners_in_map
+from thermal_fiducial.core.geometry.se3 import apply, inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.measurements import MARKER_DTYPE
 from thermal_fiducial.files.map_history import entries
@@ -60,6 +65,33 @@ def test_a_map_of_another_dictionary_is_used_and_warned_of(graph, map_file, capf
     assert 'DICT_5X5_50' in reason
     # The console says it at the start, where one looks who wonders why nothing is seen.
     assert 'has markers of DICT_5X5_50, but dictionary is DICT_4X4_50' in capfd.readouterr().err
+
+
+@pytest.mark.parametrize('focal', [1.0, 1.05])
+def test_a_calibration_that_does_not_fit_the_map_is_doubted(graph, tmp_path, focal):
+    """Before markers of different distances; those of one wall fit any focal length."""
+    centres = {key: (x + key, y, z) for key, (x, y, z) in small_bag.CENTRES.items()}
+    markers = {
+        key: MapMarker(key, small_bag.SIZE, True, transform(small_bag.R_MAP_MARKER, centre))
+        for key, centre in centres.items()
+    }
+    save_map(tmp_path / 'map.yaml', MarkerMap(markers))
+    node = graph.add(MarkerMapperNode, map_file=str(tmp_path / 'map.yaml'))
+    K = small_bag.CAMERA.K * [[focal, 1.0, 1.0], [1.0, focal, 1.0], [1.0, 1.0, 1.0]]
+    wrong = replace(small_bag.CAMERA, K=K)
+    graph.send('thermal/camera_info', info(wrong))
+    ids, sizes = np.array(list(markers)), np.full(len(markers), small_bag.SIZE)
+    points = corners_in_map(np.stack([marker.T_map_marker for marker in markers.values()]), sizes)
+    noise = np.tile(0.05**2 * np.eye(2), (len(ids), 4, 1, 1))
+    for k in range(30):
+        T_camera_map = inverse(small_bag.true_pose(k / 30) @ small_bag.T_BODY_CAMERA)
+        corners = small_bag.CAMERA.project(apply(T_camera_map, points))
+        rows = rows_from_corners(ids, corners, noise, sizes, wrong)
+        graph.send('markers', clouds.cloud(rows, convert.header(START + k * 33_333_333, 'camera')))
+    level, reason, figures = graph.diagnose(node)
+    doubted = focal > 1.0
+    assert ('corners are not where map and calibration have them' in reason, level == WARN) == (doubted, doubted)
+    assert (float(figures['misfit [sigma]']) > 1.5) == doubted
 
 
 def test_saving_keeps_the_previous_file_in_the_history(graph, map_file):

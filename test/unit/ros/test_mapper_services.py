@@ -178,4 +178,4 @@ def test_a_quarantined_marker_is_named_with_its_reason_once():
     assert map_status.news(before, now) == {7: 'marker 7 quarantined: 9.1 px off, 12.3 sigma'}
     assert map_status.news(now, before) == {7: 'marker 7 is trusted again'}
     assert map_status.state(now, '', frozen=False)[1] == 'quarantined: 3, 7'
-    assert map_status.figures(MarkerMap(), 0, now)['quarantine'] == '3: old; 7: 9.1 px off, 12.3 sigma'
+    assert map_status.figures(MarkerMap(), 0, now, 0.0)['quarantine'] == '3: old; 7: 9.1 px off, 12.3 sigma'
