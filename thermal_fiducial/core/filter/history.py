@@ -11,6 +11,8 @@ import math
 from operator import attrgetter
 from typing import NamedTuple
 
+import numpy as np
+
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.hypotheses import (
@@ -23,7 +25,7 @@ from thermal_fiducial.core.filter.hypotheses import (
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import TWO_POSES, WINDOW_SECONDS
 from thermal_fiducial.core.filter.propagation import propagated, random_walks
-from thermal_fiducial.core.filter.state import Estimate
+from thermal_fiducial.core.filter.state import Estimate, POSE, SIZE, VELOCITY
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
 from thermal_fiducial.core.measurements import CameraPose, Condition
 from thermal_fiducial.core.types import SECOND_NS
@@ -82,16 +84,28 @@ class History:
         return self._beliefs[-1]
 
     def contradicting(self) -> OtherEstimate | None:
-        """The alternative estimate at the newest sample, if the latest poses contradict the main one and support it.
+        """Another estimate at the newest sample, if the latest poses contradict the main one.
 
-        Also one without the time of a jump of the IMU's stamps, until the delay of poses shows whether it has passed.
+        It is the alternative if they support it, else, as with an IMU that contradicts all poses, where the last of
+        them has the robot. Also one without the time of a jump of the IMU's stamps, until the delay of poses shows
+        whether it has passed.
         """
         if self._stepped:
             return OtherEstimate(self._stepped.estimate, _STEPS)
-        other = self.belief.alternative
-        if other is None or other.hits < self.config.initial_poses or not (self.main and self.main.in_doubt):
+        main, other = self.main, self.belief.alternative
+        if main is None or not main.in_doubt:
             return None
+        if other is None or other.hits < self.config.initial_poses:
+            return OtherEstimate(self._by_refused(main), 1.0)
         return OtherEstimate(self._carried(other, self.imu.newest_ns).estimate, 1.0)
+
+    def _by_refused(self, main: Hypothesis) -> Estimate:
+        """``main`` where its last refused pose has it, at the mean velocity that has led there since it was right."""
+        error = np.zeros(SIZE)
+        if main.against is not None:
+            seconds = max(self.imu.newest_ns - main.accepted_ns, _KEPT_EVERY_NS) / SECOND_NS
+            error[POSE], error[VELOCITY] = main.against, main.against[3:] / seconds
+        return replace(main.estimate, state=main.estimate.state.plus(error))
 
     def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None, first_offset: float = 0.0) -> int:
         """Instant of a pose in the IMU's clock, by the clock offset of ``hypothesis``; without one ``first_offset``."""

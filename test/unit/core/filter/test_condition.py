@@ -16,6 +16,8 @@ from thermal_fiducial.core.filter.output import (
     TRACKING,
     WAITING,
 )
+from thermal_fiducial.core.geometry.se3 import camera_in_body, inverse
+from thermal_fiducial.core.measurements import CameraPose
 
 CONFIG = config(initial_poses=3)
 RATE = 200
@@ -88,6 +90,26 @@ def test_doubt_ends_with_poses_that_would_have_shown_the_error(std, accepted, en
         kept.take_in()
     assert [kept.log.latest[pose.stamp_ns].accepted for pose in poses] == [False] * 4 + [True] * accepted
     assert kept.main.in_doubt is not ends
+
+
+def test_odometry_in_doubt_allows_for_the_poses_that_contradict_it():
+    """With forces in g no alternative holds either: it claimed 5 cm to 1 m where poses were 2 to 100 m away."""
+    flight, ekf = Flight(seed=1, seconds=5.0), PoseEkf(CONFIG)
+    samples = [
+        replace(sample, linear_acceleration=(1.0 if k < 2 * RATE else 0.102) * sample.linear_acceleration)
+        for k, sample in enumerate(flight.samples())
+    ]
+    T_body_camera, pose, sigmas = camera_in_body(CONFIG), flight.poses[0], []
+    for message in timeline(samples, flight.poses):
+        if isinstance(message, CameraPose):
+            pose = message
+            ekf.add_pose(pose)
+        elif (state := ekf.add_imu(message)) is not None and ekf.status.startswith(('in doubt', 'lost')):
+            off = state.T_map_body[:3, 3] - (pose.T_map_camera @ inverse(T_body_camera))[:3, 3]
+            sigmas.append(np.linalg.norm(off) / np.sqrt(np.trace(state.pose_covariance[:3, :3])))
+    assert len(sigmas) > 2 * RATE
+    # 1.5 at most in three flights; the pose that it is compared with may be a frame old.
+    assert max(sigmas) < 3.0
 
 
 def test_a_sensor_that_poses_contradict_is_named_until_the_filter_is_initialised():
