@@ -62,7 +62,7 @@ class Hypothesis(NamedTuple):
     """An estimate with the numbers of poses that passed and failed its gate."""
 
     estimate: Estimate
-    #: instants of its first, of its last accepted pose that showed where it is, and of its last pose, in the IMU's clock
+    #: instants in the IMU's clock: of its first pose, of the last accepted one that showed where it is, of the last one
     started_ns: int
     accepted_ns: int
     compared_ns: int
@@ -103,7 +103,7 @@ class Hypothesis(NamedTuple):
 
     def staying_in_doubt(self, estimate: Estimate, shown: float) -> 'Hypothesis':
         """The hypothesis after an accepted pose that would not have shown what the refused ones claim."""
-        return self._replace(estimate=estimate, shown=shown)
+        return self._replace(estimate=estimate, compared_ns=estimate.stamp_ns, shown=shown)
 
     @property
     def in_doubt(self) -> bool:
