@@ -652,6 +652,15 @@ def test_the_console_has_a_line_for_each_change_that_a_pilot_must_know(graph, ca
     ]  # fmt: skip
 
 
+def test_a_parameter_that_is_changed_in_flight_is_logged(graph, capfd):
+    """That the pose is lost beyond another limit from here on left no trace."""
+    node = graph.add(PoseEkfNode, lost_position_std=0.3)
+    for value in (0.3, 2.0, -1.0):
+        node.set_parameters([Parameter('lost_position_std', value=value)])
+    lines = [line.partition('[pose_ekf]: ')[2] for line in capfd.readouterr().err.splitlines()]
+    assert [line for line in lines if 'parameter' in line] == ['parameter lost_position_std: 2.0, before 0.3']
+
+
 def test_a_reset_is_logged_with_its_reason_and_then_the_recovery(graph, capfd):
     node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], reset_after=0.1)
     moved = transform(np.eye(3), [0.5, 0.0, 0.0]) @ small_bag.T_BODY_CAMERA

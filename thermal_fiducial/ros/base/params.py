@@ -51,16 +51,19 @@ def declare(node: Node, kind: type[Config]) -> Config:
 
 
 def follow(node: Node, kind: type[Config], apply: Callable[[Config], None]) -> None:
-    """Call ``apply`` with the new config whenever a dynamic parameter is set; refuse invalid values."""
+    """Call ``apply`` with the new config whenever a dynamic parameter is set, and log it; refuse invalid values."""
 
     def on_set(changes: Iterable[Parameter]) -> SetParametersResult:
-        values = current_values(node, kind) | {change.name: change.value for change in changes}
+        before, new = current_values(node, kind), {change.name: change.value for change in changes}
         try:
-            apply(from_mapping(kind, values))
+            apply(from_mapping(kind, before | new))
         except InputError as error:
             return SetParametersResult(successful=False, reason=str(error))
         except Exception as error:  # a failed change must not end the node
             return SetParametersResult(successful=False, reason=f'{INTERNAL_ERROR}: {type(error).__name__}: {error}')
+        for name in before.keys() & new.keys():
+            if new[name] != before[name]:
+                node.get_logger().info(f'parameter {name}: {new[name]}, before {before[name]}')
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(on_set)
