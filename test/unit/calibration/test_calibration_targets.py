@@ -182,6 +182,7 @@ def test_points_that_were_measured_elsewhere(tmp_path, capsys):
     seen = page[page.index('class="views"') :]
     assert seen.count('<circle') == seen.count('<path') + 48 == 480
     capsys.readouterr()
+    command.append('--force')
     for broken, words in (('v0,0,1,1,0,0', 'second time'), ('v0,99,x,1,0,0', 'numbers'), ('v0,99,-9,1,0,0', 'outside')):
         table.write_text('\n'.join([*lines, broken]))
         assert main([*command, '--size', '640', '512']) == 2
