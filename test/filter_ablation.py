@@ -71,15 +71,16 @@ MECHANISMS = {
     'error of the map apart': Mechanism(
         ('map in the making',), off={'hypotheses:body_pose': _with_the_map, 'history:body_pose': _with_the_map}
     ),
-    'change of the error of the map': Mechanism(
+    'map of the present markers': Mechanism(
         ('map in the making',),
-        ('pose_noise:BodyPose.map_correlation', 'update:_with_markers'),
+        (
+            'pose_noise:BodyPose.map_change',
+            'pose_noise:BodyPose.moved_by',
+            'update:_with_markers',
+            'update:_in_map_of_markers',
+            'update:map_jacobian',
+        ),
         {'update:_with_markers': lambda estimate, _: estimate},
-    ),
-    'smaller error of the map': Mechanism(
-        ('map in the making',),
-        ('pose_noise:BodyPose.map_error_left', 'update:map_jacobian'),
-        {'pose_noise:BodyPose.map_error_left': lambda *_: np.zeros((6, 6))},
     ),
     'size of white errors is learned': Mechanism(
         ('noise of poses', 'lasting errors'),

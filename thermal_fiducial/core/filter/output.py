@@ -43,7 +43,7 @@ def odometry(estimate: Estimate, contradicting: OtherEstimate | None, sample: La
     R, velocity_body = state.R_map_body, state.velocity_body
     joint = np.zeros((18, 18))
     joint[PUBLISHED, PUBLISHED] = estimate.covariance[PUBLISHED, PUBLISHED]
-    joint[12:, 12:] = estimate.pose_noise.last.map_covariance
+    joint[12:, 12:] = estimate.pose_noise.of_map
     if contradicting:
         other = contradicting.estimate
         apart = _difference(state, other.state)

@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import covariance_root
 from thermal_fiducial.core.geometry.plausibility import LEAST_INDEPENDENT
 from thermal_fiducial.core.geometry.reprojection import lever_arm
 from thermal_fiducial.core.geometry.se3 import rotation_angle
@@ -103,36 +104,26 @@ class BodyPose:
         moved = float(np.linalg.norm(T[:3, 3] - T_last[:3, 3])) / distance
         return math.exp(-(turned + moved) / angle + log_overlap(last.shape, self.shape))
 
-    def map_correlation(self, last: 'BodyPose') -> float:
-        """Correlation, 0 to 1, of the map's errors of this pose and of the ``last`` one.
+    def map_change(self, other: FloatArray) -> FloatArray:
+        """Covariance (6, 6) of the motion from a map's error of covariance ``other`` to that of this pose.
 
-        The same markers in the same map have the same error. It falls with the overlap of the two covariances.
+        The least motion that makes one of the other (optimal transport of Gaussians; I. Olkin, F. Pukelsheim, "The
+        distance between two random vectors with given dispersion matrices", 1982): the same markers have the same
+        error, and those that were placed by them about the same. In units of what the pose claims beside it; by the
+        white part of that, covariances that the mapper evaluates at a noisy pose differ without a change.
         """
-        if not (self.map_covariance.any() or last.map_covariance.any()):
-            return 1.0
-        then, now = self._of_map(last), self._of_map(self)
-        return math.exp(log_overlap(then + self.shape, now + self.shape))
+        units = np.linalg.solve(self.by_map, np.linalg.cholesky(self.shape))
+        to_units = np.linalg.inv(units)
+        then, now = (
+            covariance_root(to_units @ C @ to_units.T + WHITE * np.eye(6)) for C in (other, self.map_covariance)
+        )
+        U, _, Vt = np.linalg.svd(then.T @ now)
+        change = units @ (now @ Vt.T - then @ U)
+        return np.asarray(change @ change.T)
 
-    def map_error_left(self, last: 'BodyPose') -> FloatArray:
-        """Covariance (6, 6), conventions of ``covariance``, by which the map's error of the ``last`` pose was larger.
-
-        An estimate made from the last pose is off by that relative to the markers of this one, as far as their errors
-        are not common to both.
-        """
-        then, now = self._of_map(last), self._of_map(self)
-        to_units = np.linalg.inv(np.linalg.cholesky(now + self.shape))
-        variances, axes = np.linalg.eigh(to_units @ (then - now) @ to_units.T)
-        roots = np.linalg.solve(to_units, axes * np.sqrt(np.maximum(variances, 0.0)))
-        return np.asarray(roots @ roots.T)
-
-    def _of_map(self, pose: 'BodyPose') -> FloatArray:
-        """What the map's error of a ``pose`` makes of this one: covariance (6, 6)."""
-        return np.asarray(self.by_map @ pose.map_covariance @ self.by_map.T)
-
-    def _in_map(self, covariance: FloatArray) -> FloatArray:
-        turn = np.zeros((6, 6))
-        turn[:3, 3:] = turn[3:, :3] = self.T_map_body[:3, :3]
-        return turn @ covariance @ turn.T
+    def moved_by(self, of_map: FloatArray) -> float:
+        """Sum of the variances of the robot's position by a motion of the map of covariance ``of_map`` (6, 6)."""
+        return float((self.by_map[3:] @ of_map @ self.by_map[3:].T).trace())
 
 
 def log_overlap(A: FloatArray, B: FloatArray) -> float:
@@ -177,11 +168,13 @@ class PoseNoise:
     #: (6,) of the last pose that was compared with the estimate, accepted or not, and its covariance (6, 6)
     innovation: FloatArray = field(default_factory=lambda: np.zeros(6))
     S: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    #: (6, 6) as ``map_covariance`` of a pose: by which the map that the estimate is in is off
+    of_map: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @classmethod
     def of(cls, first: BodyPose, stamp_jitter: float = 0.0, mount_vibration: float = 0.0) -> 'PoseNoise':
         """Initial values; ``stamp_jitter`` [s] and ``mount_vibration`` [rad] are standard deviations."""
-        return cls(first, np.array((_WHITE_AT_FIRST, stamp_jitter**2, mount_vibration**2)))
+        return cls(first, np.array((_WHITE_AT_FIRST, stamp_jitter**2, mount_vibration**2)), of_map=first.map_covariance)
 
     @property
     def stds(self) -> list[float]:

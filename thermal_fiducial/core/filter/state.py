@@ -177,7 +177,7 @@ class Estimate:
     def position_std(self) -> float:
         """Root of the sum of the position variances, the map's error included [m]."""
         to_robot = lever_arm(self.state.position)[:3]
-        of_map = to_robot @ self.pose_noise.last.map_covariance @ to_robot.T
+        of_map = to_robot @ self.pose_noise.of_map @ to_robot.T
         return math.hypot(self.std(POSITION), math.sqrt(float(of_map.trace())))
 
 

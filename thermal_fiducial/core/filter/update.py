@@ -27,7 +27,7 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
+from thermal_fiducial.core.geometry.reprojection import lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian, so3_log
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
@@ -87,6 +87,18 @@ def _unexplained(state: NavigationState, pose: BodyPose) -> FloatArray:
     return pose_error(state, inverse(state.T_map_markers) @ pose.T_map_body) - state.systematic
 
 
+def _by_map(state: NavigationState) -> FloatArray:
+    """(6, 6) derivative of a measured pose by the motion of its markers' map."""
+    T_markers_body = state.T_map_markers @ state.T_map_body
+    return displacement_of_body(T_markers_body, T_markers_body[:3, 3])
+
+
+def _moved(state: NavigationState, error: FloatArray) -> NavigationState:
+    """The state with its core and the map of the markers corrected by ``error`` (54,)."""
+    T_map_markers = retract(np.eye(4), error[MARKERS]) @ state.T_map_markers
+    return replace(state.moved(error[CORE]), T_map_markers=T_map_markers)
+
+
 def mount_jacobian(state: NavigationState) -> FloatArray:
     """(6, 3) derivative of a measured pose by a rotation of the camera against the robot, about the camera [rad]."""
     return np.vstack((np.eye(3), skew(state.T_body_camera[:3, 3])))
@@ -108,8 +120,6 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
     H = np.zeros((6, SIZE))
     H[_SIX, POSE] = 1.0
     H[:, EXTRINSICS] = H[:, SYSTEMATIC] = np.eye(6)
-    T_map_body = prior.state.T_map_markers @ prior.state.T_map_body
-    H[:, MARKERS] = displacement_of_body(T_map_body, T_map_body[:3, 3])
     mount = mount_jacobian(prior.state)
     jitter = np.outer(derivative[POSE], derivative[POSE])
     units = np.stack((pose.shape, jitter, mount @ mount.T))
@@ -120,7 +130,14 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
     else:
         R += config.time_offset_std**2 * jitter
     value = _unexplained(prior.state, pose)
+    H[:, MARKERS] = _by_map(prior.state)
     S = H @ prior.covariance @ H.T + R
+    if prior.covariance[MARKERS, MARKERS].any():
+        # New markers may be off by decimetres: a derivative from where they are thought to be would show turns of the
+        # map that nothing shows.
+        error = prior.covariance @ H.T @ np.linalg.solve(S, value)
+        H[:, MARKERS] = _by_map(_moved(prior.state, error))
+        S = H @ prior.covariance @ H.T + R
     S_inverse = np.asarray(np.linalg.inv(S))
     return Innovation(estimate, pose, motion, prior, derivative, units, value, S, S_inverse, H, R)
 
@@ -174,19 +191,36 @@ def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estim
 
 
 def _with_markers(estimate: Estimate, pose: BodyPose) -> Estimate:
-    """The estimate with the map's error propagated to the markers of ``pose``: first-order Markov."""
-    last = estimate.pose_noise.last
-    alike = pose.map_correlation(last)
-    if alike == 1.0:
+    """The estimate with the map's error propagated to the markers of ``pose``: a random walk from those of the last.
+
+    The estimate goes on in the map as they have it where that is better than its own, or differs by less than the
+    estimate is uncertain. So poor markers take away nothing that it knows.
+    """
+    noise, P = estimate.pose_noise, estimate.covariance.copy()
+    now = pose.after(noise.last, estimate.state.T_map_body)
+    if not any(C.any() for C in (now.map_covariance, noise.of_map, P[MARKERS, MARKERS])):
         return estimate
-    P, state = estimate.covariance.copy(), estimate.state
-    moved = map_jacobian(state)
-    P += (1.0 - alike**2) * moved @ pose.map_error_left(last) @ moved.T
-    P[MARKERS] *= alike
-    P[:, MARKERS] *= alike
-    P[MARKERS, MARKERS] += (1.0 - alike**2) * pose.map_covariance
-    kept = retract(np.eye(4), alike * difference(state.T_map_markers, np.eye(4)))
-    return replace(estimate, state=replace(state, T_map_markers=kept), covariance=P)
+    P[MARKERS, MARKERS] += now.map_change(noise.last.map_covariance)
+    estimate = replace(estimate, covariance=P)
+    apart, is_worse = now.map_change(noise.of_map), now.moved_by(now.map_covariance) > now.moved_by(noise.of_map)
+    if is_worse and now.moved_by(apart) > P[POSITION, POSITION].trace():
+        return estimate
+    if now.moved_by(P[MARKERS, MARKERS]) > now.moved_by(apart):
+        # The random walk knows less than the two covariances: the markers in between were worse.
+        P[MARKERS], P[:, MARKERS] = 0.0, 0.0
+        P[MARKERS, MARKERS] = apart
+        estimate = replace(estimate, state=replace(estimate.state, T_map_markers=np.eye(4)))
+    return _in_map_of_markers(replace(estimate, pose_noise=replace(noise, of_map=now.map_covariance)))
+
+
+def _in_map_of_markers(estimate: Estimate) -> Estimate:
+    """The estimate in the map as the present markers have it."""
+    state = estimate.state.in_moved_map(estimate.state.T_map_markers)
+    moved = np.eye(SIZE)
+    moved[:, MARKERS] = map_jacobian(state) @ displacement_of_body(state.T_map_body, state.position)
+    moved[MARKERS] = 0.0
+    covariance = moved @ estimate.covariance @ moved.T
+    return replace(estimate, state=replace(state, T_map_markers=np.eye(4)), covariance=covariance)
 
 
 def _second_order_of_clock(prior: Estimate, motion: MotionAtPose, derivative: FloatArray) -> FloatArray:
@@ -252,7 +286,6 @@ def _iterated(innovation: Innovation, gain: FloatArray) -> FloatArray:
     first step, is then larger than what the pose claims. (B. Bell, F. Cathey, "The iterated Kalman filter update as a
     Gauss-Newton method", IEEE TAC 1993.)
     """
-    prior, error = innovation.prior.state, gain @ innovation.value
-    T_map_markers = retract(np.eye(4), error[MARKERS]) @ prior.T_map_markers
-    left = _unexplained(replace(prior.moved(error[CORE]), T_map_markers=T_map_markers), innovation.pose)
+    error = gain @ innovation.value
+    left = _unexplained(_moved(innovation.prior.state, error), innovation.pose)
     return np.asarray(gain @ (left + error[POSE] + innovation.H[:, MARKERS] @ error[MARKERS]))

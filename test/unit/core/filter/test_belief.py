@@ -62,7 +62,7 @@ def test_the_error_of_the_map_counts_in_the_position_but_not_relative_to_the_map
     # A motion of the map that turns it about the robot.
     to_origin = lever_arm(-begun.estimate.state.position)
     of_map = to_origin @ np.diag([0.16, 0.0, 0.0, 9.0, 9.0, 9.0]) @ to_origin.T
-    noise = replace(noise, last=replace(noise.last, map_covariance=of_map))
+    noise = replace(noise, of_map=of_map)
     begun = begun._replace(estimate=replace(begun.estimate, pose_noise=noise))
     assert begun.estimate.std(POSITION) == pytest.approx(0.3)
     assert begun.estimate.position_std == pytest.approx(0.5)
