@@ -83,10 +83,16 @@ def twist_transfer(T_body_frame: FloatArray) -> FloatArray:
     return transfer
 
 
-def turned(covariance: FloatArray, R: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of a pose or twist, rotated by ``R`` (3, 3) into other axes."""
+def turn_of_pose(R: FloatArray) -> FloatArray:
+    """Map (6, 6) of a displacement of a pose, or a twist, by the rotation ``R`` (3, 3) of its axes."""
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = R
+    return turn
+
+
+def turned(covariance: FloatArray, R: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a pose or twist, rotated by ``R`` (3, 3) into other axes."""
+    turn = turn_of_pose(R)
     return np.asarray(turn @ covariance @ turn.T)
 
 

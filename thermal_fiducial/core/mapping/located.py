@@ -14,7 +14,14 @@ from thermal_fiducial.core.error_model import (
     NO_DRAWS,
 )
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, lever_arm, linearise, screwed
+from thermal_fiducial.core.geometry.reprojection import (
+    corners_in_map,
+    difference,
+    lever_arm,
+    linearise,
+    screwed,
+    turn_of_pose,
+)
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
@@ -128,7 +135,7 @@ class Location:
         """
         before = self.pose.T_map_camera
         T = screwed(before, step)
-        with_camera, with_map = np.kron(np.eye(2), T[:3, :3] @ before[:3, :3].T), lever_arm(T[:3, 3] - before[:3, 3])
+        with_camera, with_map = turn_of_pose(T[:3, :3] @ before[:3, :3].T), lever_arm(T[:3, 3] - before[:3, 3])
         of_map = with_map @ self.pose.map_covariance @ with_map.T
         own = with_camera @ (self.pose.covariance - self.pose.map_covariance + unknown) @ with_camera.T
         return replace(
