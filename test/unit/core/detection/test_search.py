@@ -77,6 +77,23 @@ def test_finds_the_marker_at_any_contrast(contrast):
     assert np.abs(found.corners_px[0] - CORNERS).max() < 4.0  # a third of a cell, which the refinement catches
 
 
+def beside_a_flame(marker_id):
+    """A marker of 28 px in a plate of 40 px, and something five times as warm that touches the plate."""
+    rng = np.random.default_rng(marker_id)
+    image = np.full((256, 320), 7000.0, dtype=np.float32)
+    image[95:135, 135:175] += 40.0
+    bits = np.pad(BITS[marker_id], 1).astype(np.float32)
+    image[101:129, 141:169] = 7000.0 + 40.0 * cv2.resize(bits, (28, 28), interpolation=cv2.INTER_AREA)
+    image[90:140, 175:200] += 200.0
+    return (cv2.GaussianBlur(image, (0, 0), 0.7) + rng.normal(0.0, 1.0, image.shape)).astype(np.float32)
+
+
+def test_something_hot_in_view_does_not_hide_a_marker():
+    found = sum(search(beside_a_flame(k)).ids.tolist() == [k] for k in range(30))
+    # 22; 9 where the contrast around is measured by squares.
+    assert found >= 18
+
+
 def test_faint_markers_brighter_than_all_round_are_found():
     """Twice the noise of a pixel; their white is the wall's, so that no plate shows."""
     found = []

@@ -1,9 +1,11 @@
 """Candidates for markers: quadrilaterals among the outlines of regions darker than their surroundings.
 
 The threshold is a share of the local standard deviation, so that markers of any contrast are found. Below a floor of
-the order of the noise it rises again: a marker of twice the noise is still segmented, a bare wall hardly at all.
+the order of the noise it rises again: a marker of twice the noise is still segmented, a bare wall hardly at all. It is
+estimated by mean absolute deviations: of squares, a flame or a lamp beside a marker would be nearly all.
 """
 
+import math
 from typing import Any, NamedTuple, TypeAlias
 
 import cv2
@@ -14,6 +16,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 
 # Window of the local standard deviation, at a quarter of the resolution: 68 px, a marker at working distance.
 _LOCAL = 17
+# Standard deviation over mean absolute deviation, of a Gaussian.
+_STD_OF_MEAN = math.sqrt(0.5 * math.pi)
 # Odd width of the median filter that removes specks.
 _SPECKS = 3
 # In a picture for a display: odd width of the surroundings, no wider than the white around the smallest markers; least
@@ -82,9 +86,9 @@ class DarkRegions:
         limit = cv2.blur(self._smooth if scale.window_shrink == 1 else coarse, window)
         small = halved(coarse)
         deviation = small - cv2.blur(small, (_LOCAL, _LOCAL))
-        variance = np.maximum(cv2.blur(deviation * deviation, (_LOCAL, _LOCAL)), TINY)
+        spread = np.maximum(_STD_OF_MEAN * cv2.blur(np.abs(deviation), (_LOCAL, _LOCAL)), TINY)
         floor = (_FLOOR_OF_CLEAR if clear else scale.floor) * noise
-        asked = (scale.depth / np.sqrt(variance)) * (variance + floor * floor)
+        asked = scale.depth * (spread + floor * floor / spread)
         cv2.subtract(limit, cv2.resize(asked, limit.shape[::-1], interpolation=cv2.INTER_LINEAR), dst=limit)
         if limit.shape != counts.shape:
             limit = self._limit = cv2.resize(limit, size, dst=self._limit, interpolation=cv2.INTER_LINEAR)
