@@ -94,6 +94,8 @@ class PoseEkf:
             self._refused_in_row += 1
             return False
         self._refused_in_row = 0
+        if self._input.jump_ns:
+            self._camera_clock.imu_jumped(self._input.jump_ns)
         if self._input.excess_ns:
             self._suspect_steps()
         imu, buffer = np.concatenate((sample.angular_velocity, sample.linear_acceleration)), self._history.imu
@@ -141,9 +143,7 @@ class PoseEkf:
     # --- steps of the clocks --------------------------------------------------------------------------
 
     def _suspect_steps(self) -> None:
-        """Allow for steps of the clocks after the newest sample kept, as far as the stamps of the IMU suggest them."""
-        if self._input.jump_ns:
-            self._camera_clock.imu_jumped(self._input.jump_ns)
+        """Allow for steps ahead of the clocks after the newest sample kept, as far as the IMU's stamps suggest them."""
         excess_ns = self._input.excess_ns
         self._history.suspect_clock_steps(excess_ns)
         if self._input.jump_ns and excess_ns >= SMALLEST_STEP_NS:

@@ -239,6 +239,15 @@ def test_a_jump_of_the_imu_s_stamps_may_be_time_that_did_not_pass(step):
     assert squares_behind_step(flight, output).max() < chi2.ppf(0.9973, 6)
 
 
+@pytest.mark.parametrize('step', [-0.05, -0.2])
+def test_a_step_back_of_the_imu_s_clock_is_none_of_the_camera_s(step):
+    """Taken for one, it put the pose 0.2 m off, beyond three sigma for 0.2 s."""
+    stds = {'rotation_std': (0.003, 0.003, 0.001), 'translation_std': (0.0003, 0.0003, 0.003)}
+    _, output, flight = flown_by_a_stepping_imu(step, Flight(seed=1, seconds=5.0, **stds))
+    # three sigma, of six degrees of freedom
+    assert squares_behind_step(flight, output).max() < chi2.ppf(0.9973, 6)
+
+
 def test_lost_samples_are_claimed_to_be_a_step_of_the_clock_until_the_next_pose():
     flight = Flight(seed=1, seconds=5.0)
     arrivals = timeline(flight.samples(), flight.poses, LATE)
