@@ -8,6 +8,7 @@ import sys
 import time
 
 import pytest
+from support.empty_stage import environment
 from support.tasks import work
 
 from thermal_fiducial.errors import InputError
@@ -161,7 +162,8 @@ def test_work_for_a_node_that_was_killed_ends_without_a_word():
         '    os._exit(0)\n'
     )
     # It returns when the last process has closed its standard error.
-    ended = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True)
+    command = [sys.executable, '-c', program]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True, env=environment())
     assert ended.stderr == ''
 
 
