@@ -13,7 +13,7 @@ from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
 
-pytestmark = pytest.mark.skipif('THERMAL_FIDUCIAL_DATA' not in os.environ, reason='no real data at hand')
+pytestmark = pytest.mark.skipif(not os.environ.get('THERMAL_FIDUCIAL_DATA'), reason='no real data at hand')
 
 
 @cache
