@@ -49,6 +49,11 @@ def displacement_of_body(T_map_body: FloatArray, arm: FloatArray) -> FloatArray:
     return turn @ lever_arm(arm)
 
 
+def displacement_by_map(T_map_body: FloatArray) -> FloatArray:
+    """As :func:`displacement_of_body`, from a motion of the map about its origin."""
+    return displacement_of_body(T_map_body, T_map_body[:3, 3])
+
+
 @dataclass(frozen=True)
 class BodyPose:
     """A measured pose of the robot."""
@@ -67,7 +72,7 @@ class BodyPose:
     @cached_property
     def by_map(self) -> FloatArray:
         """(6, 6) its derivative by a motion of the map about its origin, in the conventions of ``covariance``."""
-        return displacement_of_body(self.T_map_body, self.T_map_body[:3, 3])
+        return displacement_by_map(self.T_map_body)
 
     def after(self, last: 'BodyPose', T_map_body: FloatArray) -> 'BodyPose':
         """It as the ``last`` pose of the next one, seen from ``T_map_body`` of the estimate.
@@ -112,14 +117,28 @@ class BodyPose:
         error, and those that were placed by them about the same. In units of what the pose claims beside it; by the
         white part of that, covariances that the mapper evaluates at a noisy pose differ without a change.
         """
-        units = np.linalg.solve(self.by_map, np.linalg.cholesky(self.shape))
-        to_units = np.linalg.inv(units)
-        then, now = (
-            covariance_root(to_units @ C @ to_units.T + WHITE * np.eye(6)) for C in (other, self.map_covariance)
-        )
+        now, then = self._map_root, self._in_units(other)
         U, _, Vt = np.linalg.svd(then.T @ now)
-        change = units @ (now @ Vt.T - then @ U)
+        change = self._map_units @ (now @ Vt.T - then @ U)
         return np.asarray(change @ change.T)
+
+    @cached_property
+    def _map_units(self) -> FloatArray:
+        """(6, 6) motions of the map that move the pose by a standard deviation of what it claims beside the map."""
+        return np.linalg.solve(self.by_map, np.linalg.cholesky(self.shape))
+
+    @cached_property
+    def _to_map_units(self) -> FloatArray:
+        return np.asarray(np.linalg.inv(self._map_units))
+
+    @cached_property
+    def _map_root(self) -> FloatArray:
+        return self._in_units(self.map_covariance)
+
+    def _in_units(self, of_map: FloatArray) -> FloatArray:
+        """Root (6, 6) of the covariance ``of_map`` and of white noise, in the units of ``_map_units``."""
+        to_units = self._to_map_units
+        return covariance_root(to_units @ of_map @ to_units.T + WHITE * np.eye(6))
 
     def moved_by(self, of_map: FloatArray) -> float:
         """Sum of the variances of the robot's position by a motion of the map of covariance ``of_map`` (6, 6)."""

@@ -101,6 +101,11 @@ class NavigationState:
             position=self.position + R_left @ error[POSITION],
         )
 
+    def moved_in_map(self, error: FloatArray) -> 'NavigationState':
+        """The state with its core and the map of the markers corrected by ``error`` (54,)."""
+        T_map_markers = retract(np.eye(4), error[MARKERS]) @ self.T_map_markers
+        return replace(self.moved(error[CORE]), T_map_markers=T_map_markers)
+
     def plus(self, error: FloatArray) -> 'NavigationState':
         """The state corrected by ``error`` (54,): X Exp(xi) for the group part, a sum for the rest."""
         T_body_camera = self.T_body_camera
@@ -108,14 +113,13 @@ class NavigationState:
             turn, shift = error[EXTRINSICS][:3], error[EXTRINSICS][3:]
             T_body_camera = transform(so3_exp(turn), so3_left_jacobian(turn) @ shift) @ T_body_camera
         return replace(
-            self.moved(error[CORE]),
+            self.moved_in_map(error),
             bias=self.bias + error[BIAS],
             scale=self.scale + error[SCALES].reshape(2, 3, 3),
             gravity=with_horizontal(self.gravity, self.gravity[:2] + error[GRAVITY]),
             time_offset=self.time_offset + float(error[TIME_OFFSET]),
             T_body_camera=T_body_camera,
             systematic=self.systematic + error[SYSTEMATIC],
-            T_map_markers=retract(np.eye(4), error[MARKERS]) @ self.T_map_markers,
         )
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'NavigationState':

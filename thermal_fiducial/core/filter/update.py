@@ -9,7 +9,13 @@ import numpy as np
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
-from thermal_fiducial.core.filter.pose_noise import BodyPose, displacement_of_body, PoseNoise, share_that_stays
+from thermal_fiducial.core.filter.pose_noise import (
+    BodyPose,
+    displacement_by_map,
+    displacement_of_body,
+    PoseNoise,
+    share_that_stays,
+)
 from thermal_fiducial.core.filter.state import (
     clock_offset_derivative,
     CORE,
@@ -27,7 +33,7 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry.reprojection import lever_arm, retract
+from thermal_fiducial.core.geometry.reprojection import lever_arm
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian, so3_log
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
@@ -89,14 +95,7 @@ def _unexplained(state: NavigationState, pose: BodyPose) -> FloatArray:
 
 def _by_map(state: NavigationState) -> FloatArray:
     """(6, 6) derivative of a measured pose by the motion of its markers' map."""
-    T_markers_body = state.T_map_markers @ state.T_map_body
-    return displacement_of_body(T_markers_body, T_markers_body[:3, 3])
-
-
-def _moved(state: NavigationState, error: FloatArray) -> NavigationState:
-    """The state with its core and the map of the markers corrected by ``error`` (54,)."""
-    T_map_markers = retract(np.eye(4), error[MARKERS]) @ state.T_map_markers
-    return replace(state.moved(error[CORE]), T_map_markers=T_map_markers)
+    return displacement_by_map(state.T_map_markers @ state.T_map_body)
 
 
 def mount_jacobian(state: NavigationState) -> FloatArray:
@@ -136,7 +135,7 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
         # New markers may be off by decimetres: a derivative from where they are thought to be would show turns of the
         # map that nothing shows.
         error = prior.covariance @ H.T @ np.linalg.solve(S, value)
-        H[:, MARKERS] = _by_map(_moved(prior.state, error))
+        H[:, MARKERS] = _by_map(prior.state.moved_in_map(error))
         S = H @ prior.covariance @ H.T + R
     S_inverse = np.asarray(np.linalg.inv(S))
     return Innovation(estimate, pose, motion, prior, derivative, units, value, S, S_inverse, H, R)
@@ -217,7 +216,7 @@ def _in_map_of_markers(estimate: Estimate) -> Estimate:
     """The estimate in the map as the present markers have it."""
     state = estimate.state.in_moved_map(estimate.state.T_map_markers)
     moved = np.eye(SIZE)
-    moved[:, MARKERS] = map_jacobian(state) @ displacement_of_body(state.T_map_body, state.position)
+    moved[:, MARKERS] = map_jacobian(state) @ displacement_by_map(state.T_map_body)
     moved[MARKERS] = 0.0
     covariance = moved @ estimate.covariance @ moved.T
     return replace(estimate, state=replace(state, T_map_markers=np.eye(4)), covariance=covariance)
@@ -287,5 +286,5 @@ def _iterated(innovation: Innovation, gain: FloatArray) -> FloatArray:
     Gauss-Newton method", IEEE TAC 1993.)
     """
     error = gain @ innovation.value
-    left = _unexplained(_moved(innovation.prior.state, error), innovation.pose)
+    left = _unexplained(innovation.prior.state.moved_in_map(error), innovation.pose)
     return np.asarray(gain @ (left + error[POSE] + innovation.H[:, MARKERS] @ error[MARKERS]))
