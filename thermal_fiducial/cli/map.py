@@ -64,15 +64,14 @@ def add_arguments(parser: Parser) -> None:
     map_sources.add_refine(add_command(commands, 'refine', 'adjust a map to the detections of a run'))
     map_comparison.add_error(add_command(commands, 'error', 'compare a map with the true one'))
     map_cloud.add_align(add_command(commands, 'align', 'align a map to a point cloud of the place'))
+    parser.refuse(
+        ['--marker-size', '--marker-size-override'],
+        'with map history, undo and upgrade',
+        lambda args: args.do in (_history, _undo, _upgrade),
+    )
     for name, action in commands.choices.items():
-        add_sizes(action, behind=True, without=_SIZE_WITHOUT.get(name, 'none'))
-    without_sizes = _history, _undo, _upgrade
-    for place in (parser, *(commands.choices[name] for name in ('history', 'undo', 'upgrade'))):
-        place.refuse(
-            ['--marker-size', '--marker-size-override'],
-            'with map history, undo and upgrade',
-            lambda args: args.do in without_sizes,
-        )
+        if name not in ('history', 'undo', 'upgrade'):
+            add_sizes(action, behind=True, without=_SIZE_WITHOUT.get(name, 'none'))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,6 +11,7 @@ from thermal_fiducial.errors import InputError
 def add_sizes(parser: Parser, *, behind: bool = False, without: str = 'none') -> None:
     """Add the options to a command, or to one of its actions (``behind``); ``without``: the side if none is given."""
     size = argparse.SUPPRESS if behind else None
+    parser.set_defaults(sizes_behind=[])
     text = f'side of markers whose entry has none [m] (default: {without})'
     parser.add_argument('--marker-size', type=SIDE_M, default=size, metavar='M', help=text)
     # The parser of an action begins with empty lists, and would overwrite those of the command under the same name.

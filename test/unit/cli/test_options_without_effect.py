@@ -48,8 +48,6 @@ PLATE = '--dictionary --size --thickness --stand-off --corner-radius --bridge-wi
         )),
         *((['map', '--marker-size', '0.3', name, 'map.yaml'], '--marker-size', name)
           for name in ('undo', 'history', 'upgrade')),
-        *((['map', name, 'map.yaml', '--marker-size-override', '1:0.3'], '--marker-size-override', name)
-          for name in ('undo', 'history', 'upgrade')),
     ],
 )  # fmt: skip
 def test_refused_with_both_names(words, option, other, capsys, tmp_path, monkeypatch):
@@ -66,11 +64,18 @@ def test_options_for_bags_are_refused_with_pictures(words, capsys, tmp_path):
     assert f': {words[0]} has no effect with a folder of pictures' in capsys.readouterr().err
 
 
-def test_spacers_are_no_option_where_nothing_is_drawn(capsys):
+@pytest.mark.parametrize(
+    'words',
+    [
+        ('markers', 'check', '--stand-off', '10'),
+        *(('map', name, 'map.yaml', '--marker-size', '0.3') for name in ('undo', 'history', 'upgrade')),
+    ],
+)
+def test_commands_have_no_option_that_they_always_refuse(words, capsys):
     with pytest.raises(SystemExit) as stopped:
-        main(['markers', 'check', '--stand-off', '10'])
+        main(words)
     assert stopped.value.code == 2
-    assert 'unrecognized arguments: --stand-off' in capsys.readouterr().err
+    assert f'unrecognized arguments: {words[-2]}' in capsys.readouterr().err
 
 
 def test_frames_for_a_video_are_read_from_a_named_bag(capsys):
