@@ -4,7 +4,7 @@ from thermal_fiducial.files.innovations import INNOVATIONS
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.table import number, Table
 
-#: Units of the nodes' figures; the others have none.
+#: Units of the filter's figures, all SI; the others have none, or one in their name.
 _UNITS = {
     'seconds since accepted pose': 's',
     'position std': 'm',
@@ -19,11 +19,8 @@ _UNITS = {
     'gyroscope scale error': '1',
     'accelerometer scale error': '1',
     'map tilt': 'rad',
-}
-#: Figures of one name and two units, as names of their own.
-_VIBRATION = {
-    'vibration rad/s/sqrt(Hz)': ('gyroscope noise under vibration', 'rad/s/sqrt(Hz)'),
-    'vibration m/s^2/sqrt(Hz)': ('accelerometer noise under vibration', 'm/s^2/sqrt(Hz)'),
+    'gyroscope noise under vibration': 'rad/s/sqrt(Hz)',
+    'accelerometer noise under vibration': 'm/s^2/sqrt(Hz)',
 }
 #: Figures left out: the table of innovations has them for the whole run, the nodes only for the latest poses.
 _ELSEWHERE = ('received ', 'published ', 'poses accepted', 'poses refused', 'NIS per d.o.f.', INNOVATIONS)
@@ -64,9 +61,7 @@ def figures_tables(evaluation: Evaluation) -> dict[str, Table]:
 def _split(name: str, value: str) -> tuple[str, str, str]:
     """Name without unit, value and unit of a figure."""
     unit = _UNITS.get(name, 'count' if value.isdigit() else '')
-    if name in _VIBRATION:
-        name, unit = _VIBRATION[name]
-    elif name.endswith(']'):
+    if name.endswith(']'):
         name, _, unit = name[:-1].rpartition(' [')
     return name, _rounded(value), unit
 

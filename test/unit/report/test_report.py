@@ -323,7 +323,7 @@ def test_figures_and_load_of_the_nodes(small_run):
     counted = {'withheld: FFC': '12', 'refused messages': '0', 'received /thermal/image_raw': '9'}
     rates = {
         'rate /thermal/image_raw [Hz]': '29.9',
-        'vibration m/s^2/sqrt(Hz)': '0.00181305',
+        'accelerometer noise under vibration': '0.00181305',
         'map tilt': '9.17798e-06',
     }
     diagnostics = {'tau2_camera': counted | rates, 'pose_ekf': {'resets': '0', 'in view': '2, 3'}}

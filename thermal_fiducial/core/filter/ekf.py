@@ -306,8 +306,8 @@ class PoseEkf:
             'poses refused': float(self._history.log.refused),
             'IMU samples refused': float(self._imu_refused),
             'NIS per d.o.f.': self._history.log.mean_nis(),
-            'vibration rad/s/sqrt(Hz)': rate,
-            'vibration m/s^2/sqrt(Hz)': force,
+            'gyroscope noise under vibration': rate,
+            'accelerometer noise under vibration': force,
         }
         main, state = self._history.main, self.state
         if main is None or state is None:
