@@ -18,7 +18,7 @@ from thermal_fiducial.calibration.targets import settles_a_pose, Sighting, Targe
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import Counts, Gray
-from thermal_fiducial.core.wording import number_of
+from thermal_fiducial.core.wording import listed, number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import read_gray
@@ -104,7 +104,7 @@ class BoardViews:
         for frame in self.unusable:
             frames[_kind(frame.reason)].append(frame)
         often = sorted(frames.values(), key=len, reverse=True)[:_MOST_REASONS]
-        return [f'{_listed([frame.name for frame in alike])}: {alike[0].reason}' for alike in often]
+        return [f'{listed((frame.name for frame in alike), _MOST_NAMES)}: {alike[0].reason}' for alike in often]
 
     def look_again(self, camera: Camera) -> None:
         """Find the board again in all views, with the calibrated camera."""
@@ -127,12 +127,6 @@ class BoardViews:
 def _kind(reason: str) -> str:
     """A reason without its figures."""
     return re.sub(r'\d+(\.\d+)?', '', reason)
-
-
-def _listed(names: Sequence[str]) -> str:
-    if len(names) <= _MOST_NAMES:
-        return ', '.join(names)
-    return f'{names[0]} and {len(names) - 1} more'
 
 
 def look_at_points(source: Path, size: tuple[int, int]) -> BoardViews:

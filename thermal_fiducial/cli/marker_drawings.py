@@ -17,6 +17,7 @@ from thermal_fiducial.cli.subcommands import add_force, refuse_to_overwrite
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import base_plate, circle_board, LEAST_MARKERS, marker_grid
 from thermal_fiducial.fabrication.drawing import Drawing
@@ -224,8 +225,8 @@ def _write_all(drawings: Sequence[Drawing], args: argparse.Namespace, others: Se
     for stem, drawing in zip(stems, drawings, strict=True):
         _write_checked(drawing, [args.out / f'{stem}.{kind}' for kind in formats], args.paper)
         notes = '\n  '.join(('', *drawing.notes))
-        parts = '1 part' if drawing.parts == 1 else f'{drawing.parts} parts'
-        print(f'{args.out / stem}: {drawing.width:.1f} x {drawing.height:.1f} mm, {parts}{notes}')
+        size = f'{drawing.width:.1f} x {drawing.height:.1f} mm'
+        print(f'{args.out / stem}: {size}, {number_of(drawing.parts, "part")}{notes}')
 
 
 def _formats(args: argparse.Namespace) -> list[str]:

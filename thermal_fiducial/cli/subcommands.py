@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 import math
 from pathlib import Path
 
+from thermal_fiducial.core.wording import listed
 from thermal_fiducial.errors import InputError
 
 
@@ -98,5 +99,4 @@ def refuse_to_overwrite(paths: Iterable[Path], force: bool) -> None:
     """
     existing = [] if force else [path for path in paths if path.exists()]
     if existing:
-        others = f' and {len(existing) - 1} more' if len(existing) > 1 else ''
-        raise InputError(f'{existing[0]}{others}: the file exists; --force overwrites it')
+        raise InputError(f'{listed(existing, 1)}: the file exists; --force overwrites it')

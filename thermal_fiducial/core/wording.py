@@ -1,6 +1,16 @@
-"""Numbers of things in messages."""
+"""Numbers and lists of things in messages."""
+
+from collections.abc import Iterable
+import sys
 
 
 def number_of(count: int, noun: str) -> str:
     """A count and its noun, "1 marker" or "3 markers"; ``noun`` is the singular of one that takes an s."""
     return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
+
+
+def listed(names: Iterable[object], most: int = sys.maxsize) -> str:
+    """Names with commas between them; beyond ``most`` only the number of the others: "1, 2 and 3 more"."""
+    words = [str(name) for name in names]
+    more = f' and {len(words) - most} more' if len(words) > most else ''
+    return ', '.join(words[:most]) + more

@@ -9,7 +9,7 @@ from thermal_fiducial.core.geometry.reprojection import corners_in_map, lever_ar
 from thermal_fiducial.core.geometry.se3 import apply, rigid_alignment
 from thermal_fiducial.core.mapping.map_data import align, Alignment, MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.core.wording import number_of
+from thermal_fiducial.core.wording import listed, number_of
 from thermal_fiducial.errors import InputError
 
 
@@ -163,7 +163,7 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[M
 def marker_of(marker_map: MarkerMap, marker_id: int) -> MapMarker:
     """The marker of an ID. Raises InputError if it is not in the map."""
     if marker_id not in marker_map.markers:
-        known = ', '.join(str(key) for key in sorted(marker_map.markers)) or 'none'
+        known = listed(sorted(marker_map.markers)) or 'none'
         raise InputError(f'marker {marker_id} is not in the map; the IDs of its markers: {known}')
     return marker_map.markers[marker_id]
 

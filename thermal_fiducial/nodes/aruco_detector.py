@@ -10,6 +10,7 @@ from sensor_msgs.msg import Image, PointCloud2
 from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig, unknown_markers
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
+from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.ros.base import qos
@@ -78,10 +79,9 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
 
     def state(self) -> tuple[bytes, str]:
         """Number of markers in the last frame, markers of another dictionary, images skipped since the last call."""
-        seen = '1 marker' if self._seen == 1 else f'{self._seen} markers'
         left = self._images.left_since()
         doubts = [self._dictionaries.doubt, f'{left} older images skipped' if left else '']
-        return WARN if any(doubts) else OK, '; '.join(filter(None, [seen, *doubts]))
+        return WARN if any(doubts) else OK, '; '.join(filter(None, [number_of(self._seen, 'marker'), *doubts]))
 
     def headline(self) -> str:
         """That the markers in view are of another dictionary."""

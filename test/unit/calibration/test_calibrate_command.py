@@ -254,8 +254,8 @@ def test_reasons_that_differ_in_a_figure_are_one_in_the_error():
     with pytest.raises(InputError) as refused:
         views.require(Path('views'))
     assert str(refused.value) == (
-        'views: 0 of 17 frames are usable views, a calibration needs 6; v0.png and 13 more: the circles are 2.01 times '
-        'as wide; dark.png, grey.png: too faint; broken.png: not a readable picture'
+        'views: 0 of 17 frames are usable views, a calibration needs 6; v0.png, v1.png, v2.png and 11 more: the '
+        'circles are 2.01 times as wide; dark.png, grey.png: too faint; broken.png: not a readable picture'
     )
 
 

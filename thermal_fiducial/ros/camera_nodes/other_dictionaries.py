@@ -6,6 +6,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import Counts, Gray, SECOND_NS
+from thermal_fiducial.core.wording import listed
 from thermal_fiducial.files.dictionary import load_dictionary, packaged
 
 #: Dictionaries that are looked for: all that the package ships, and the usual ones of OpenCV, which hold the smaller
@@ -17,6 +18,8 @@ _PERIOD_NS = SECOND_NS
 _CERTAIN = 3
 #: Looks at markers of our own dictionary after which it is right: one for each other dictionary.
 _SETTLED = len(_USUAL)
+#: Most IDs that the warning names.
+_MOST_NAMES = 5
 
 
 class OtherDictionaries:
@@ -72,7 +75,7 @@ class OtherDictionaries:
             return
         found = {name: self._exact(name, image, camera) for name in self._names}
         most = max(map(len, found.values()))
-        words = [f'{_listed(ids)} of {name}' for name, ids in found.items() if len(ids) == most]
+        words = [f'{listed(sorted(ids), _MOST_NAMES)} of {name}' for name, ids in found.items() if len(ids) == most]
         seen = ' or '.join(words)
         self.doubt = f'dictionary is {self._own}, but the markers in view are {seen}: set the parameter dictionary'
 
@@ -80,9 +83,3 @@ class OtherDictionaries:
         """IDs in an image that has nothing to do with the one before it: a detector that knows of none."""
         rows = MarkerDetector(self._config, load_dictionary(name)).detect(0, image, camera)
         return {int(marker_id) for marker_id in rows['id']}
-
-
-def _listed(ids: set[int]) -> str:
-    """The first few, in words."""
-    shown = ', '.join(map(str, sorted(ids)[:5]))
-    return shown if len(ids) <= 5 else f'{shown} and others'

@@ -1,7 +1,6 @@
 """Status of the mapper: diagnostics and console lines."""
 
 from collections import deque
-from collections.abc import Iterable
 import math
 from statistics import median
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from thermal_fiducial.core.mapping.located import error_std_px, LocatedFrame, Location
 from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
+from thermal_fiducial.core.wording import listed
 from thermal_fiducial.ros.base.node import OK, WARN
 
 #: Covariance of a camera that is taken as it is.
@@ -58,7 +58,7 @@ def state(result: MapperResult, doubts: str, *, frozen: bool, left: int = 0) -> 
     if result.reason or doubts:
         return WARN, '; '.join(filter(None, (result.reason, doubts)))
     if result.quarantined:
-        return WARN, f'quarantined: {_listed(result.quarantined)}'
+        return WARN, f'quarantined: {listed(result.quarantined)}'
     if left:
         return WARN, f'{left} older frames skipped'
     return OK, 'map frozen' if frozen else 'ok'
@@ -71,8 +71,8 @@ def figures(marker_map: MarkerMap, corrections: int, result: MapperResult, misfi
         'map revision': marker_map.revision,
         'map corrections': corrections,
         'misfit [sigma]': f'{misfit:.2f}',
-        'in view': _listed(sorted(result.in_view)),
-        'quarantined': _listed(result.quarantined),
+        'in view': listed(sorted(result.in_view)),
+        'quarantined': listed(result.quarantined),
         'quarantine': '; '.join(f'{key}: {why}' for key, why in sorted(result.quarantine_reasons.items())),
         'candidates': '; '.join(f'{key}: {reason}' for key, reason in result.candidates.items()),
     }
@@ -84,7 +84,3 @@ def news(before: MapperResult, now: MapperResult) -> dict[int, str]:
     into = {key: f'marker {key} quarantined: {now.quarantine_reasons[key]}' for key in sorted(new)}
     out = {key: f'marker {key} is trusted again' for key in before.quarantined if key not in now.quarantined}
     return into | out
-
-
-def _listed(ids: Iterable[int]) -> str:
-    return ', '.join(str(key) for key in ids)
