@@ -56,7 +56,7 @@ setup(
             'shapely',
             'allantools',
         ],
-        'video': ['av'],  # or ffmpeg: evaluate --video
+        'video': ['av'],  # evaluate --video
         'batch': ['distributed>=2024.4'],
         'test': [
             'pytest',

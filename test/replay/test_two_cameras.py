@@ -123,7 +123,7 @@ def test_a_second_camera_that_the_bag_lacks_is_refused(folder, capsys):
 def test_the_replayed_bag_of_a_robot_in_a_namespace_is_read_again(folder, recording, tmp_path, monkeypatch):
     """For the video, pictures of the report, and the calibration of the run: the camera without a name is the first."""
     bag = recording.renamed(lambda topic: f'one/{topic}').write(tmp_path / 'bag')
-    monkeypatch.setattr('thermal_fiducial.report.video.require_encoder', lambda: 'none')
+    monkeypatch.setattr('thermal_fiducial.report.video.require_encoder', lambda: None)
     written = []
     monkeypatch.setattr('thermal_fiducial.cli.replay.make_video', written.append)
     assert replay(folder, bag, 'inside', '--second-camera', 'down', '--video') == 0

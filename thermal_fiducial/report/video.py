@@ -1,11 +1,8 @@
-"""A video of a run: thermal frames with markers, time, state and position, by ffmpeg or PyAV."""
+"""A video of a run: thermal frames with markers, time, state and position, by PyAV."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-import shutil
-import subprocess
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,19 +26,10 @@ _LINE_PX = 26
 Frame = npt.NDArray[np.uint8]
 
 
-def require_encoder() -> str:
-    """``ffmpeg`` or ``av``, whichever is installed, ffmpeg first.
-
-    Raises
-    ------
-    InputError
-        Neither is installed.
-    """
-    if shutil.which('ffmpeg'):
-        return 'ffmpeg'
-    if is_installed('av'):
-        return 'av'
-    raise InputError('--video needs ffmpeg (apt install ffmpeg) or PyAV (install the extra "video")')
+def require_encoder() -> None:
+    """Raise InputError if PyAV is not installed."""
+    if not is_installed('av'):
+        raise InputError('--video needs PyAV: install the extra "video"')
 
 
 def write_video(
@@ -61,7 +49,7 @@ def write_video(
     InputError
         No encoder, no bag, or a file that cannot be written.
     """
-    encoder = require_encoder()
+    require_encoder()
     replayed = bag_of(run, bag)
     if replayed is None:
         raise InputError(f'{run.path}: no video: the bag is not where it was (--bag names it)')
@@ -73,8 +61,7 @@ def write_video(
         if first is None:
             raise InputError(f'{reader.path}: no video: the bag has no usable frame')
         # An incomplete video is useless, and the report may show an earlier one.
-        encode = _ffmpeg if encoder == 'ffmpeg' else _pyav
-        with new_file(path) as new, naming(path), encode(new, first, rate) as take:
+        with new_file(path) as new, naming(path), _encoded(new, first, rate) as take:
             take(first)
             for index, frame in enumerate(frames, 2):
                 take(frame)
@@ -122,31 +109,8 @@ def _place(run: Run, stamp_ns: int) -> str:
 
 
 @contextmanager
-def _ffmpeg(path: Path, first: Frame, rate: float) -> Iterator[Callable[[Frame], None]]:
-    height, width = first.shape[:2]
-    source = ['-f', 'rawvideo', '-pix_fmt', 'bgr24', '-s', f'{width}x{height}', '-r', str(rate), '-i', '-']
-    sink = ['-c:v', 'libx264', '-crf', '24', '-pix_fmt', 'yuv420p', '-movflags', '+faststart', str(path)]
-    command = ['ffmpeg', '-y', '-loglevel', 'error', *source, *sink]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        assert process.stdin is not None
-        assert process.stderr is not None
-        try:
-            yield lambda frame: _feed(process.stdin, frame)
-        except BrokenPipeError:
-            pass
-        finally:
-            process.stdin.close()
-        said = process.stderr.read().decode(errors='replace').strip()
-        if process.wait():
-            raise InputError(f'ffmpeg cannot write the video: {said.splitlines()[-1] if said else "no reason"}')
-
-
-def _feed(pipe: Any, frame: Frame) -> None:
-    pipe.write(np.ascontiguousarray(frame).tobytes())
-
-
-@contextmanager
-def _pyav(path: Path, first: Frame, rate: float) -> Iterator[Callable[[Frame], None]]:
+def _encoded(path: Path, first: Frame, rate: float) -> Iterator[Callable[[Frame], None]]:
+    """Context with a function that takes the frames of a video, all of the size of the ``first`` one."""
     from fractions import Fraction
 
     import av

@@ -67,7 +67,7 @@ def test_a_missing_tool_is_named_in_one_line(run_folder, options):
     ('options', 'hidden', 'words'),
     [
         ((), ('plotly',), 'the report needs plotly: install the extra "tools", or replay with --no-report'),
-        (('--no-report', '--video'), ('av',), '--video needs ffmpeg (apt install ffmpeg) or PyAV'),
+        (('--no-report', '--video'), ('av',), '--video needs PyAV: install the extra "video"'),
     ],
 )
 def test_a_replay_names_missing_packages_before_it_begins(tmp_path, monkeypatch, options, hidden, words):

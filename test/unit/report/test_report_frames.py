@@ -25,7 +25,7 @@ from thermal_fiducial.report.page import evaluate_run, write_page
 from thermal_fiducial.report.run_folder import read_run
 
 SECONDS = 0.4
-needs_encoder = pytest.mark.skipif(not (shutil.which('ffmpeg') or find_spec('av')), reason='neither ffmpeg nor PyAV')
+needs_encoder = pytest.mark.skipif(not find_spec('av'), reason='no PyAV')
 
 
 @pytest.fixture(scope='module')
@@ -126,13 +126,9 @@ def test_a_recorder_with_another_clock_shows_the_same_frames(flight, tmp_path):
     assert [p.uri for p in strip(run, late.write(tmp_path / 'late'))] == [p.uri for p in strip(run)]
 
 
-@pytest.mark.parametrize('encoder', ['ffmpeg', 'av'])
-def test_a_video_of_all_frames(flight, encoder, monkeypatch):
+def test_a_video_of_all_frames(flight):
     av = pytest.importorskip('av')
-    if encoder == 'ffmpeg' and not shutil.which('ffmpeg'):
-        pytest.skip('no ffmpeg')
-    monkeypatch.setattr(video, 'require_encoder', lambda: encoder)
-    path = flight / f'{encoder}.mp4'
+    path = flight / 'frames.mp4'
     shares = []
     video.write_video(read_run(flight / 'run'), path, progress=shares.append)
     with av.open(str(path)) as container:
@@ -189,13 +185,6 @@ def test_the_video_calls_the_shutter_by_its_name(flight, monkeypatch):
     video.write_video(run, flight / 'shutter.mp4')
     reasons = [line.partition(' s ')[2].strip() for line in lines[::2]]
     assert reasons == [''] * 4 + ['shutter (FFC)'] * 3 + [''] * 2 + ['frozen'] + [''] * (len(stamps) - 10)
-
-
-def test_without_an_encoder_the_error_names_the_package(monkeypatch):
-    monkeypatch.setattr(video.shutil, 'which', lambda name: None)
-    monkeypatch.setattr(video, 'is_installed', lambda name: False)
-    with pytest.raises(InputError, match=r'apt install ffmpeg.*extra "video"'):
-        video.require_encoder()
 
 
 def test_a_video_that_cannot_be_written_is_one_line(flight, tmp_path):
