@@ -18,7 +18,7 @@ import numpy as np
 from support import approach
 from support.detector_scores import DetectorScore, odometry_before
 from support.scenes import camera_of
-from support.taken_out import lines_of, place, replaced
+from support.taken_out import lines_of, Mechanism, place, replaced
 
 from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
@@ -135,29 +135,6 @@ def run(name: str, changes: dict[str, Any]) -> tuple[DetectorScore, float]:
     return score, seconds / frames
 
 
-@dataclass(frozen=True)
-class Mechanism:
-    """A part of the detector that can be taken out.
-
-    Parameters
-    ----------
-    scene : that it is for
-    parts : modules, or functions and classes of modules as ``module:name``, that exist for it alone
-    off : places (``module:name``, ``module:class.name``), and what is put there
-    changes : parameters that switch it off, where there are any
-    """
-
-    scene: str
-    parts: tuple[str, ...]
-    off: dict[str, Any]
-    changes: dict[str, Any] | None = None
-
-    @property
-    def lines(self) -> int:
-        """Of its parts."""
-        return lines_of(DETECTION, self.parts)
-
-
 def _place(path: str) -> Any:
     return place(DETECTION, path)
 
@@ -183,56 +160,60 @@ _UNEVEN = 'corners.pattern_residuals:Unevenness', 'corners.pattern_residuals:_be
 
 MECHANISMS = {
     'corners of squares': Mechanism(
-        'slow, 0.5 K, blind', ('corners.squares',), {'corners.side_fit:as_squares': _as_seen}
+        ('slow, 0.5 K, blind',), ('corners.squares',), {'corners.side_fit:as_squares': _as_seen}
     ),
-    'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_INCONSISTENT': np.inf}),
-    'passes until settled': Mechanism('fast, 8 K, blind', (), {'corners.refining:PASSES': 1}),
-    'second round': Mechanism('fast, 8 K, blind', (), {'corners.refining:_ROUNDS': 1}),
-    'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
-    'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
-    'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'prediction.frame:_HARDLY_PX': np.inf}),
+    'other tilt of a square': Mechanism(('slow, 0.1 K, blind',), (), {'corners.squares:_INCONSISTENT': np.inf}),
+    'passes until settled': Mechanism(('fast, 8 K, blind',), (), {'corners.refining:PASSES': 1}),
+    'second round': Mechanism(('fast, 8 K, blind',), (), {'corners.refining:_ROUNDS': 1}),
+    'outlying segments': Mechanism(('slow, 8 K, blind',), (), {'corners.segments:_ROUNDS': 1}),
+    'outlying pixels': Mechanism(('slow, 8 K, blind',), (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
+    'lag tails taken out': Mechanism(('fast, 8 K, blind',), (), {'prediction.frame:_HARDLY_PX': np.inf}),
     'whole patterns in motion blur': Mechanism(
-        'fast, 8 K, guided', (), {'corners.refining:too_blurred_for_sides': _by_optics_alone}
+        ('fast, 8 K, guided',), (), {'corners.refining:too_blurred_for_sides': _by_optics_alone}
     ),
-    'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
+    'rolling shutter': Mechanism(('rolling shutter',), _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(
-        'fast, 8 K, blind', (), {'corners.corner_errors:OF_LAG': 0.0, 'corners.corner_errors:OF_LAG_FORM': 0.0}
+        ('fast, 8 K, blind',), (), {'corners.corner_errors:OF_LAG': 0.0, 'corners.corner_errors:OF_LAG_FORM': 0.0}
     ),
     'partially visible markers': Mechanism(
-        'landing', ('partial.partial_markers', 'partial.visible_cells', 'partial.grid'), {'detector:_ENOUGH_WHOLE': 0}
+        ('landing',),
+        ('partial.partial_markers', 'partial.visible_cells', 'partial.grid'),
+        {'detector:_ENOUGH_WHOLE': 0},
     ),
-    'uneven levels, slow': Mechanism('8 bits, slow', _UNEVEN, _EVEN),
-    'uneven levels, carpet': Mechanism('carpet', _UNEVEN, _EVEN),
-    'polarity': Mechanism('slow, 8 K, blind', ('finding.finder:FrameHistory.polarities',), {}, {'polarity': 'any'}),
+    'uneven levels, slow': Mechanism(('8 bits, slow',), _UNEVEN, _EVEN),
+    'uneven levels, carpet': Mechanism(('carpet',), _UNEVEN, _EVEN),
+    'polarity': Mechanism(('slow, 8 K, blind',), ('finding.finder:FrameHistory.polarities',), {}, {'polarity': 'any'}),
     'half resolution': Mechanism(
-        'slow, 0.5 K, blind', (), {'finding.finder:_next_scales': lambda *_, **__: _SCALES.FINE}
+        ('slow, 0.5 K, blind',), (), {'finding.finder:_next_scales': lambda *_, **__: _SCALES.FINE}
     ),
-    'one resolution in turn': Mechanism('slow, 8 K, blind', (), _ALL_IN_THE_SEARCH),
+    'one resolution in turn': Mechanism(('slow, 8 K, blind',), (), _ALL_IN_THE_SEARCH),
     'outlines pulled onto patterns': Mechanism(
-        'slow, 0.1 K, blind',
+        ('slow, 0.1 K, blind',),
         ('corners.pattern_fit:aligned',),
         {'finding.search:_rough': lambda *_: np.zeros(0, dtype=np.intp)},
     ),
     'markers in plates': Mechanism(
-        'fast, 0.5 K, blind',
+        ('fast, 0.5 K, blind',),
         ('patterns:shrunk', 'finding.search:_with_shrunk'),
         {'finding.search:_with_shrunk': lambda quads, _: quads},
     ),
-    'large markers halved': Mechanism('landing', ('confirmation:_read',), {'confirmation:_WIDE_CELL_PX': np.inf}),
+    'large markers halved': Mechanism(('landing',), ('confirmation:_read',), {'confirmation:_WIDE_CELL_PX': np.inf}),
     'columns of the frame': Mechanism(
-        'slow, 0.1 K, guided', (), {'prediction.frame:with_columns_corrected': lambda counts, _: counts}
+        ('slow, 0.1 K, guided',), (), {'prediction.frame:with_columns_corrected': lambda counts, _: counts}
     ),
     'following': Mechanism(
-        'slow, 0.1 K, blind',
+        ('slow, 0.1 K, blind',),
         ('finding.finder:followed',),
         {'finding.finder:followed': _nothing_found},
     ),
     'search near predictions': Mechanism(
-        'fast, 0.5 K, guided',
+        ('fast, 0.5 K, guided',),
         ('finding.finder:near_prediction', 'finding.finder:_shifted'),
         {'finding.finder:near_prediction': _nothing_found},
     ),
-    'branches by the map': Mechanism('slow, 0.1 K, guided', (), {'detector:choose_branches': lambda poses, *_: poses}),
+    'branches by the map': Mechanism(
+        ('slow, 0.1 K, guided',), (), {'detector:choose_branches': lambda poses, *_: poses}
+    ),
 }
 
 
@@ -244,19 +225,17 @@ def _figures(score: DetectorScore, seconds: float) -> str:
 
 
 def _row(key: str, mechanism: Mechanism, base: dict[str, tuple[DetectorScore, float]]) -> str:
+    (own,) = mechanism.scenes
     with replaced(DETECTION, mechanism.off):
-        scenes = {name: run(name, mechanism.changes or {}) for name in {*ACCEPTANCE, mechanism.scene}}
+        scenes = {name: run(name, mechanism.changes) for name in {*ACCEPTANCE, own}}
     both = [(base[name], scenes[name]) for name in ACCEPTANCE]
     seen = [(old[0].rms_px, new[0].rms_px) for old, new in both if new[0].seen]
     error = np.exp(np.mean([np.log(new / old) for old, new in seen]))
     slower = np.exp(np.mean([np.log(new[1] / old[1]) for old, new in both]))
     rate = 100 * np.mean([new[0].rate - old[0].rate for old, new in both])
     false = sum(new[0].false - old[0].false for old, new in both)
-    cells = [key, str(mechanism.lines), mechanism.scene, _figures(*base[mechanism.scene])]
-    cells += [
-        _figures(*scenes[mechanism.scene]),
-        f'x {error:.2f}, {rate:+.1f} %, {false:+d} false, time x {slower:.2f}',
-    ]
+    cells = [key, str(lines_of(DETECTION, mechanism.parts)), own, _figures(*base[own]), _figures(*scenes[own])]
+    cells.append(f'x {error:.2f}, {rate:+.1f} %, {false:+d} false, time x {slower:.2f}')
     return f'| {" | ".join(cells)} |'
 
 
@@ -264,7 +243,7 @@ def main() -> None:
     """Print the table."""
     cv2.setNumThreads(1)
     chosen = {key: MECHANISMS[key] for key in sys.argv[1:] or MECHANISMS}
-    base = {name: run(name, {}) for name in {*ACCEPTANCE, *(mechanism.scene for mechanism in chosen.values())}}
+    base = {name: run(name, {}) for name in {*ACCEPTANCE, *(mechanism.scenes[0] for mechanism in chosen.values())}}
     print('| mechanism | lines | its scene | with | without | acceptance scenes without |')
     print('| --- | --- | --- | --- | --- | --- |')
     for key, mechanism in chosen.items():

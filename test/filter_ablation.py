@@ -6,14 +6,13 @@ mechanisms as arguments: only these. Recordings are taken where ``THERMAL_FIDUCI
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cache
+from dataclasses import replace
 import sys
 from typing import Any
 
 import numpy as np
-from support.filter_scenes import Figures, SCENES
-from support.taken_out import ablation_row, lines_of
+from support.filter_scenes import SCENES
+from support.taken_out import Mechanism, Study
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.pose_noise import LIMITS
@@ -24,29 +23,6 @@ FILTER = 'thermal_fiducial.core.filter'
 NOTABLE = 0.1
 #: Scenes that every mechanism is judged by.
 ACCEPTANCE = ('brisk', 'cam0')
-
-
-@dataclass(frozen=True)
-class Mechanism:
-    """A part of the filter that can be taken out.
-
-    Parameters
-    ----------
-    scenes : that it is for, beside those of acceptance
-    parts : modules, or functions and classes of modules as ``module:name``, that exist for it alone
-    off : places (``module:name``, ``module:class.name``), and what is put there
-    changes : parameters that take it out
-    """
-
-    scenes: tuple[str, ...]
-    parts: tuple[str, ...] = ()
-    off: dict[str, Any] = field(default_factory=dict)
-    changes: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def lines(self) -> int:
-        """Of its parts."""
-        return lines_of(FILTER, self.parts)
 
 
 def _first(value: Any) -> Callable[..., Any]:
@@ -152,30 +128,9 @@ MECHANISMS = {
 }
 
 
-@cache
-def base(scene: str) -> Figures:
-    """A scene with all mechanisms."""
-    return SCENES[scene]({})
-
-
-def figures_of(scene: str, mechanism: Mechanism | None = None) -> Figures:
-    """Of a scene, with all mechanisms or while one is taken out."""
-    return base(scene) if mechanism is None else SCENES[scene](mechanism.changes)
-
-
-def row(name: str, mechanism: Mechanism) -> str:
-    """A line of the table."""
-    scenes = (scene for scene in dict.fromkeys((*mechanism.scenes, *ACCEPTANCE)) if scene in SCENES)
-    return ablation_row(name, mechanism, FILTER, scenes, figures_of, NOTABLE)
-
-
 def main() -> None:
     """Print the table."""
-    chosen = sys.argv[1:] or list(MECHANISMS)
-    print('| mechanism | lines | without it |')
-    print('| --- | --- | --- |')
-    for name in chosen:
-        print(row(name, MECHANISMS[name]), flush=True)
+    Study(FILTER, MECHANISMS, SCENES, NOTABLE, ACCEPTANCE).print(sys.argv[1:])
 
 
 if __name__ == '__main__':

@@ -5,15 +5,15 @@ twentieth without it. A mechanism is switched off by putting what does nothing i
 arguments: only these. Recordings are taken where ``THERMAL_FIDUCIAL_DATA`` names their folder, else left out.
 """
 
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import replace
+from functools import partial
 import sys
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from support.mapper_scenes import Figures, SCENES
-from support.taken_out import ablation_row, lines_of
+from support.mapper_scenes import SCENES
+from support.taken_out import Mechanism, Study
 
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.mapping.localization import locate
@@ -21,27 +21,6 @@ from thermal_fiducial.core.mapping.localization import locate
 MAPPING = 'thermal_fiducial.core.mapping'
 #: Change of a figure that is worth printing.
 NOTABLE = 0.05
-
-
-@dataclass(frozen=True)
-class Mechanism:
-    """A part of the mapper that can be taken out.
-
-    Parameters
-    ----------
-    scenes : that it is for
-    parts : modules, or functions and classes of modules as ``module:name``, that exist for it alone
-    off : places (``module:name``, ``module:class.name``), and what is put there
-    """
-
-    scenes: tuple[str, ...]
-    parts: tuple[str, ...]
-    off: dict[str, Any]
-
-    @property
-    def lines(self) -> int:
-        """Of its parts."""
-        return lines_of(MAPPING, self.parts)
 
 
 def _ignored(*_: Any, **__: Any) -> None:
@@ -163,32 +142,10 @@ MECHANISMS = {
 }
 
 
-@cache
-def base(scene: str) -> Figures:
-    """A scene with all mechanisms."""
-    return SCENES[scene]()
-
-
-def figures_of(scene: str, mechanism: Mechanism | None = None) -> Figures:
-    """Of a scene, with all mechanisms or while one is taken out."""
-    return base(scene) if mechanism is None else SCENES[scene]()
-
-
-def row(name: str, mechanism: Mechanism) -> str:
-    """A line of the table."""
-    scenes = (scene for scene in mechanism.scenes if scene in SCENES)
-    return ablation_row(name, mechanism, MAPPING, scenes, figures_of, NOTABLE)
-
-
 def main() -> None:
     """Print the table."""
-    chosen = sys.argv[1:] or list(MECHANISMS)
-    for scene in sorted({scene for name in chosen for scene in MECHANISMS[name].scenes} & SCENES.keys()):
-        print(scene, {what: float(f'{value:.4g}') for what, value in base(scene).items()}, flush=True)
-    print('| mechanism | lines | without it |')
-    print('| --- | --- | --- |')
-    for name in chosen:
-        print(row(name, MECHANISMS[name]), flush=True)
+    scenes = {name: lambda _, fly=fly: fly() for name, fly in SCENES.items()}
+    Study(MAPPING, MECHANISMS, scenes, NOTABLE).print(sys.argv[1:])
 
 
 if __name__ == '__main__':

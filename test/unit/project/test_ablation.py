@@ -3,7 +3,7 @@
 from importlib import import_module
 
 import pytest
-from support.taken_out import replaced
+from support.taken_out import lines_of, replaced
 
 PACKAGES = {'ablation': 'detection', 'mapper_ablation': 'mapping', 'filter_ablation': 'filter'}
 
@@ -12,7 +12,8 @@ PACKAGES = {'ablation': 'detection', 'mapper_ablation': 'mapping', 'filter_ablat
 def test_every_mechanism_is_there_to_be_taken_out(study):
     mechanisms = import_module(study).MECHANISMS
     for mechanism in mechanisms.values():
+        package = f'thermal_fiducial.core.{PACKAGES[study]}'
         # Both raise where what they name is gone.
-        lines = mechanism.lines
-        with replaced(f'thermal_fiducial.core.{PACKAGES[study]}', mechanism.off):
+        lines = lines_of(package, mechanism.parts)
+        with replaced(package, mechanism.off):
             assert (lines > 0) == bool(mechanism.parts)
