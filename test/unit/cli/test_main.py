@@ -51,17 +51,9 @@ def test_wrong_usage_names_what_lists_the_arguments(argv, lists, capsys):
     [
         ['demo', '--seed', '-1'],
         ['map', 'refine', 'map.yaml', 'run', '--max-frames', '0'],
-        ['map', 'build', 'photos', '--calibration', 'tau2.yaml', '--out', 'map.yaml', '--origin', '-1'],
-        ['markers', 'dictionary', 'own.yaml', '--count', '0'],
-        ['markers', 'dictionary', 'own.yaml', '--seed', '-1'],
         ['markers', 'dictionary', 'own.yaml', '--restarts', '2.5'],
-        ['markers', 'measure', 'own.yaml', '--markers', '0'],
-        ['markers', 'plan', '--bits', '-4'],
         ['markers', 'plan', '--bits', '99999'],
         ['calibrate', 'intrinsics', 'views', '--grid', '99999', '99999'],
-        ['calibrate', 'intrinsics', 'views', '--every', '0'],
-        ['calibrate', 'intrinsics', 'views', '--longer-rows', '-1'],
-        ['calibrate', 'intrinsics', 'views', '--out', 'tau2.yaml', '--target', 'circles', '--most-views', '0'],
     ],
 )
 def test_numbers_that_cannot_be_are_named_with_their_option(words, capsys):
@@ -151,13 +143,6 @@ def test_names_that_no_file_can_have_are_refused_in_one_line(tmp_path, capfd, mo
     assert len(error) < 600
 
 
-def test_unusable_input_is_one_line(tmp_path, capsys):
-    assert main(['evaluate', str(tmp_path / 'missing')]) == 2
-    error = capsys.readouterr().err
-    assert error.count('\n') == 1
-    assert str(tmp_path / 'missing') in error
-
-
 def test_a_missing_extra_is_named(capsys, monkeypatch):
     def without_rich(name):
         raise ModuleNotFoundError("No module named 'rich'", name='rich.progress')
@@ -212,6 +197,18 @@ def test_help_describes_every_option_with_its_default(command, monkeypatch):
             if action.nargs != 0 and not action.required:
                 assert 'default' in said, f'{parser.prog} {action.option_strings}'
                 assert said.count('default') == 1, f'{parser.prog} {action.option_strings}'
+
+
+@pytest.mark.parametrize('command', COMMANDS)
+def test_every_number_has_a_range_with_its_default_in_it(command, monkeypatch):
+    """None holds NaN or infinity, as those of ``float`` do."""
+    for parser in parsers_of(command, monkeypatch):
+        for action in actions(parser):
+            assert action.type not in (int, float), f'{parser.prog} {action.dest}'
+            values = action.default if isinstance(action.default, list | tuple) else [action.default]
+            if action.type is not None and all(type(value) in (int, float) for value in values):
+                # argparse itself does not look.
+                assert [action.type(str(value)) for value in values] == list(values)
 
 
 @pytest.mark.parametrize('command', COMMANDS)

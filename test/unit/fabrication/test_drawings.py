@@ -514,30 +514,6 @@ def test_lengths_that_no_plate_has_and_markers_that_no_dictionary_has_are_refuse
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    'options',
-    [
-        ['make', '--min-web', 'nan'],
-        ['sheet', '--sheet', '1000', '-600'],
-        ['sheet', '--spacing', '-5'],
-        ['sheet', '--margin', 'inf'],
-        ['board', 'circles', '--diameter', '-20'],
-    ],
-)
-def test_lengths_of_sheets_are_no_negative_ones(tmp_path, capsys, options):
-    with pytest.raises(SystemExit) as ended:
-        main(['markers', *options, '--out', str(tmp_path / 'plates')])
-    assert ended.value.code == 2
-    assert 'is not a number from 0 to 10000 mm' in capsys.readouterr().err
-
-
 def test_a_board_without_spacing_is_not_one_of_the_default(tmp_path, capsys):
     assert main(['markers', 'board', 'circles', '--spacing', '0', '--out', str(tmp_path / 'board')]) == 2
     assert 'a millimetre of acrylic between them' in capsys.readouterr().err
-
-
-def test_a_board_of_more_circles_than_a_camera_sees_is_refused(tmp_path, capsys):
-    out = tmp_path / 'board'
-    assert status(['markers', 'board', 'circles', '--grid', '100000', '100000', '--out', out]) == 2
-    assert "argument --grid: '100000' is not a whole number, 1 to 100" in capsys.readouterr().err
-    assert not out.exists()

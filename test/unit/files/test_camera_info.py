@@ -76,23 +76,6 @@ def test_a_broken_calibration_is_named(tmp_path, change, words):
     assert '\n' not in str(error.value)
 
 
-@pytest.mark.parametrize('text', ['', '- 1\n- 2\n', '{', 'a: b: c', '\x00'])
-def test_what_is_no_calibration_is_refused(tmp_path, text):
-    path = tmp_path / 'camera.yaml'
-    path.write_text(text)
-    with pytest.raises(InputError, match=r'camera\.yaml') as error:
-        load_camera(path)
-    assert '\n' not in str(error.value)
-
-
-def test_a_missing_or_binary_calibration_is_refused(tmp_path):
-    with pytest.raises(InputError, match='No such file'):
-        load_camera(tmp_path / 'none.yaml')
-    (tmp_path / 'binary.yaml').write_bytes(b'\xff\xfe\x80')
-    with pytest.raises(InputError, match=r'binary\.yaml'):
-        load_camera(tmp_path / 'binary.yaml')
-
-
 def test_saving_where_nothing_can_be_written_is_refused(tmp_path):
     with pytest.raises(InputError, match='No such file'):
         save_camera(tmp_path / 'none' / 'camera.yaml', CAMERAS[0])
@@ -121,8 +104,3 @@ def test_a_broken_line_is_named(tmp_path, line):
     path.write_text(f'1 2\n{line}\n')
     with pytest.raises(InputError, match='line 2'):
         load_bad_pixels(path)
-
-
-def test_a_missing_list_is_refused(tmp_path):
-    with pytest.raises(InputError, match='No such file'):
-        load_bad_pixels(tmp_path / 'none.txt')

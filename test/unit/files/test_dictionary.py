@@ -64,14 +64,6 @@ def test_errors_of_a_dictionary_file_name_the_fault(change, words, tmp_path):
         load_dictionary(path)
 
 
-@pytest.mark.parametrize('content', [b'{', b'\xff\xfe\x00'])
-def test_unreadable_file(content, tmp_path):
-    path = tmp_path / 'own.yaml'
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=r'own\.yaml'):
-        load_dictionary(path)
-
-
 @pytest.mark.parametrize('name', ['DICT_4X4_51', 'getPredefinedDictionary', '/nowhere/at/all.yaml', ''])
 def test_unknown_name(name):
     with pytest.raises(InputError, match='neither'):

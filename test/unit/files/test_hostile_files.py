@@ -11,7 +11,6 @@ import subprocess
 import sys
 import time
 
-import numpy as np
 import pytest
 from support.empty_picture import png
 
@@ -102,9 +101,12 @@ def test_files_that_are_none(tmp_path, load):
     os.mkfifo(tmp_path / 'pipe')
     with (tmp_path / 'sparse').open('wb') as file:
         file.truncate(1 << 34)
+    (tmp_path / 'binary').write_bytes(b'\xff\xfe\x00\x81')
     for path in (
         Path('/dev/zero'),
         tmp_path,
+        tmp_path / 'missing',
+        tmp_path / 'binary',
         tmp_path / 'pipe',
         tmp_path / 'sparse',
         Path('a\0b'),
@@ -201,27 +203,6 @@ def test_pictures_that_promise_more_than_any_camera(tmp_path, size):
     assert f'{path}: not a readable picture' in line
     assert kilobytes < BYTES / 1024
     assert seconds < SECONDS
-
-
-def test_detections_with_nan_are_refused(tmp_path, capsys):
-    from thermal_fiducial.cli.main import main
-
-    names = ['stamp_ns', 'id', *(f'{axis}{corner}' for corner in range(4) for axis in 'uv'), 'sigma_px']
-    good = ['1000', '2', *map(str, range(8)), '0.1']
-    (tmp_path / 'map.yaml').write_text(MAP)
-    K = np.array([[500.0, 0, 320], [0, 500, 256], [0, 0, 1]]).ravel().tolist()
-    (tmp_path / 'camera.yaml').write_text(
-        f'image_width: 640\nimage_height: 512\ncamera_matrix: {{data: {K}}}\n'
-        'distortion_coefficients: {data: [0, 0, 0, 0, 0]}\n'
-    )
-    for column, value in ((0, 'nan'), (1, '1e30'), (1, '-3'), (4, 'nan'), (10, 'inf'), (5, 'x')):
-        row = [*good[:column], value, *good[column + 1 :]]
-        (tmp_path / 'detections.csv').write_text(','.join(names) + '\n' + ','.join(row) + '\n')
-        files = [str(tmp_path / name) for name in ('map.yaml', 'detections.csv', 'camera.yaml')]
-        assert main(['map', 'refine', *files[:2], '--calibration', files[2]]) == 2
-        error = capsys.readouterr().err
-        assert 'line 2' in error
-        assert error.count('\n') == 1
 
 
 def test_a_lock_file_that_is_a_link_is_neither_followed_nor_cut(tmp_path, monkeypatch):

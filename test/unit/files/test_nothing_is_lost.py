@@ -283,15 +283,6 @@ def test_an_edit_that_could_not_be_read_back_is_refused(path, capsys, arguments)
     assert 'Traceback' not in capsys.readouterr().err
 
 
-def test_an_old_map_is_upgraded(path, capsys):
-    text = path.read_text()
-    path.write_text(text.replace('version: 1\nrevision: 1', 'version: 12'))
-    assert main(['map', 'show', str(path)]) == 2
-    assert 'map upgrade' in capsys.readouterr().err
-    assert main(['map', 'upgrade', str(path)]) == 0
-    assert load_map(path).revision == 12
-
-
 def test_the_check_names_markers_that_the_dictionary_has_not(path, capsys):
     save_map(path, MarkerMap({77: MapMarker(77, 0.3, True, np.eye(4))}))
     assert main(['map', 'check', str(path)]) == 1

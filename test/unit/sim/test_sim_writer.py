@@ -147,15 +147,6 @@ def test_a_rough_rig_is_named_as_calibrated_and_its_stamps_jitter_about_the_offs
     assert 0.2e6 < np.std(np.diff(imu)) < 0.4e6
 
 
-def test_true_corners_beside_it(bag):
-    rows = np.loadtxt(bag / 'ground_truth_corners.csv', delimiter=',', skiprows=1, dtype=str)
-    frame = next(render_frames(BEHIND, SECONDS, 3, quality=COARSE))
-    assert int(rows[0, 0]) == frame.stamp_ns
-    corners = rows[0, 2:].astype(float).reshape(4, 2)
-    # Four decimals are written.
-    np.testing.assert_allclose(corners, frame.corners_px[int(rows[0, 1])], atol=1e-4)
-
-
 @pytest.mark.parametrize('storage', ['mcap', pytest.param('sqlite3', marks=pytest.mark.nightly)])
 def test_same_seed_same_bytes_with_any_number_of_workers(bag, tmp_path, storage):
     def written(folder, workers):
