@@ -841,8 +841,7 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
     )
     resume: bool = param(
         True,
-        'After a crash in flight, check the first poses against the last pose and start from the last clock offset, '
-        'both stored in ~/.ros (ROS_HOME).',
+        'After a crash in flight, start from the last clock offset, which is stored in ~/.ros (ROS_HOME).',
     )
     publish_lost: bool = param(False, 'Publish `pose` also while it is lost; `odometry` is always published.')
     publish_tf: bool = param(False, 'Publish map to base_frame and base_frame to camera_frame on /tf (needs tf2_ros).')

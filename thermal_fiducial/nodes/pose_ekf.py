@@ -55,7 +55,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.take_waiting()
         self._imu.measure()
         pose = self._corrections.in_present_map(message_bytes.camera_pose(message))
-        update = self._memory.refusal(self.filter, pose) or self.filter.add_pose(pose)
+        update = self.filter.add_pose(pose)
         self._status.after_pose(update)
         self._outputs.send_clock(update.stamp_ns, self.filter.camera_time_offset)
 
@@ -75,7 +75,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._imu.begin_period()
         super().diagnose(stamp_ns)
         self._outputs.send_path()
-        self._memory.save(self.filter, self._outputs.stamp_ns)
+        self._memory.save(self.filter)
 
     def state(self) -> tuple[bytes, str]:
         """Level and message: status of the filter, reason of the last refusal, delay."""

@@ -2,11 +2,9 @@
 
 That is enough: the pose error is linear in the error coordinates, so that the next two or three poses determine
 velocity and tilt whatever their true values are.
-
-A filter that restarts in flight has the last pose before as well: it rejects implausible first poses.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -31,14 +29,13 @@ from thermal_fiducial.core.filter.state import (
 )
 from thermal_fiducial.core.geometry.se3 import (
     camera_in_body,
-    inverse,
     skew,
     so3_exp,
     so3_left_jacobian,
     transform,
 )
-from thermal_fiducial.core.measurements import CameraPose, Condition, VAGUE
-from thermal_fiducial.core.types import FloatArray, SECOND_NS, TINY
+from thermal_fiducial.core.measurements import Condition, VAGUE
+from thermal_fiducial.core.types import FloatArray, TINY
 
 #: Window [s] of the samples that a first pose is compared with.
 WINDOW_SECONDS = 0.5
@@ -53,12 +50,6 @@ _VERTICAL_STD = 0.1
 _STEPS = 5
 #: Why nothing begins with a vague pose.
 TWO_POSES = Condition('two poses are possible', 'gravity does not show which one; move, or show another marker')
-#: Longest time [s] for which the last pose still limits where the robot can be.
-HINT_SECONDS = 10.0
-#: Largest distance of the robot from its last pose: a constant [m] and a speed [m/s].
-_NEAR, _SPEED = 0.5, 3.0
-# Time for which poses in a row contradict the hint until it is dropped [ns], and fewest poses that must do so.
-_PROOF_NS, _FEWEST = SECOND_NS, 5
 
 
 def blank_state(config: PoseEkfConfig) -> NavigationState:
@@ -181,47 +172,3 @@ def _initial_variances(config: PoseEkfConfig) -> FloatArray:
     stds[GRAVITY] = config.gravity * config.map_tilt_std
     stds[EXTRINSICS] = np.repeat((config.extrinsics_orientation_std, config.extrinsics_position_std), 3)
     return np.square(stds)
-
-
-@dataclass(frozen=True)
-class LastPose:
-    """The last pose of a filter before it ended, and its clock offset."""
-
-    stamp_ns: int
-    #: (4, 4)
-    T_map_body: FloatArray
-    #: t_imu - t_camera [s]; None: not known
-    camera_time_offset: float | None
-
-
-class RestartHint:
-    """Keeps the wrong branch of a planar pose, or a duplicated marker, from initialising a restarted filter.
-
-    Parameters
-    ----------
-    last : state before the restart
-    T_body_camera : (4, 4)
-    """
-
-    def __init__(self, last: LastPose, T_body_camera: FloatArray) -> None:
-        self._last = last
-        self._T_camera_body = inverse(T_body_camera)
-        #: stamp of the first of the latest poses in a row that contradict the hint, and their number
-        self._since_ns, self._contradictions = 0, 0
-        self._dropped = False
-
-    def contradiction(self, pose: CameraPose) -> float:
-        """Distance [m] of an implausibly far pose from the last one; 0 if the pose is plausible."""
-        seconds = (pose.stamp_ns - self._last.stamp_ns) / SECOND_NS + (self._last.camera_time_offset or 0.0)
-        if not 0.0 <= seconds <= HINT_SECONDS or self._dropped:
-            return 0.0
-        position = (pose.T_map_camera @ self._T_camera_body)[:3, 3]
-        distance = float(np.linalg.norm(position - self._last.T_map_body[:3, 3]))
-        if distance <= _NEAR + _SPEED * seconds:
-            self._contradictions = 0
-            return 0.0
-        if self._contradictions == 0:
-            self._since_ns = pose.stamp_ns
-        self._contradictions += 1
-        self._dropped = self._contradictions > _FEWEST and pose.stamp_ns - self._since_ns >= _PROOF_NS
-        return 0.0 if self._dropped else distance

@@ -36,8 +36,6 @@ class FilterOutputs:
     ) -> None:
         self._config, self._frames = config, frames
         self._state = StateBytes(config.map_frame, config.base_frame)
-        #: stamp of the latest state; 0 before there is one
-        self.stamp_ns = 0
         self._path = PathBytes(config.map_frame)
         self._pose = node.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
         self._odometry = node.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
@@ -68,7 +66,6 @@ class FilterOutputs:
         if (T_imu_base := self._frames.T_imu_base) is not None:
             odometry = in_frame(odometry, T_imu_base)
             smooth = None if smooth is None else in_frame(smooth, T_imu_base)
-        self.stamp_ns = odometry.stamp_ns
         self._state.fill(odometry)
         if self._config.publish_lost or not lost:
             self._pose.send(self._state.pose)
