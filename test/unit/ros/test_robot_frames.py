@@ -143,6 +143,26 @@ def test_a_robot_that_is_too_large_is_refused_and_another_one_taken(graph, joint
 
 
 @pytest.mark.ros
+def test_an_imu_frame_that_nothing_connects_with_the_robot_is_named(graph, capfd):
+    node = graph.add(PoseEkfNode)
+
+    def diagnosed(k):
+        message = imu(k)
+        message.header.frame_id = 'imu'
+        graph.send('imu/data', message)
+        return graph.diagnose(node)[1]
+
+    # As long as nothing but parameters says where the camera is, there is nothing to compare with.
+    assert 'taken for' not in diagnosed(0)
+    graph.send('robot_description', String(data=URDF), profile=qos.LATCHED)
+    unknown = "IMU in frame 'imu', not connected with base_link by robot_description: taken for base_link"
+    assert all(unknown in diagnosed(k) for k in (1, 2))
+    assert capfd.readouterr().err.count(unknown) == 1
+    graph.send('robot_description', String(data=URDF.replace('imu_link', 'imu')), profile=qos.LATCHED)
+    assert 'taken for' not in diagnosed(3)
+
+
+@pytest.mark.ros
 def test_an_imu_beside_the_robots_origin_gives_the_pose_of_the_robot(graph):
     """Camera poses of a robot at rest in the origin, whose IMU is 5 cm above it."""
     node = graph.add(PoseEkfNode)

@@ -70,6 +70,14 @@ class RobotFrames:
         """Whether the wait is over and the parameters are the source."""
         return self.decided and self.source == _PARAMETERS
 
+    @property
+    def doubt(self) -> str:
+        """That TF or the URDF, which have the camera, do not know the IMU's frame; empty if they do, or have no say."""
+        frame, base = self._imu_frame, self._node.config.base_frame
+        if not self.decided or self.source == _PARAMETERS or not frame or self._is_on_robot(frame):
+            return ''
+        return f'IMU in frame {frame[:_LONGEST_NAME]!r}, not connected with {base} by {self.source}: taken for {base}'
+
     def note_imu_frame(self, frame: str) -> None:
         """Use the frame of an IMU message as the IMU frame, if TF or the URDF know it; a later one is only reported."""
         frame = frame.lstrip('/')
@@ -120,7 +128,12 @@ class RobotFrames:
                 self._node.console.event('camera', text)
                 return
             self._take(source, T_body_camera, T_imu_base, moved=moved)
-            return
+            break
+        self._name_doubt()
+
+    def _name_doubt(self) -> None:
+        if self.doubt:
+            self._node.console.event('imu', self.doubt)
 
     def _take(self, source: str, T_body_camera: FloatArray, T_imu_base: FloatArray | None, *, moved: bool) -> None:
         if T_imu_base is not None and not np.abs(T_imu_base[:3, 3]).max() < _FARTHEST:
@@ -147,6 +160,7 @@ class RobotFrames:
         self.decided = True
         if self.source == _PARAMETERS:
             self._say()
+        self._name_doubt()
 
     def _say(self, remark: str = '') -> None:
         config = self._node.config
