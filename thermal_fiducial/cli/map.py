@@ -30,6 +30,7 @@ from thermal_fiducial.files.marker_map import dump_map, load_map
 from thermal_fiducial.files.packages import require_plots
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.map_tools import map_editing
+from thermal_fiducial.report.map_error import sigmas
 
 #: What the actions that add markers take for the side of one where nothing is said.
 _SIZE_WITHOUT = {
@@ -155,11 +156,11 @@ def _show(args: argparse.Namespace) -> int:
     for key in sorted(marker_map.markers):
         m = marker_map.markers[key]
         x, y, z = m.T_map_marker[:3, 3]
-        sigma = [float(np.sqrt(max(np.trace(block), 0.0))) for block in (m.covariance[:3, :3], m.covariance[3:, 3:])]
+        sigma_mm, sigma_deg = sigmas(m)
         status = 'quarantine' if not m.trusted else 'fixed' if m.fixed else ''
         table.add_row(
             str(key), f'{m.size:g}', f'{x:.4f}', f'{y:.4f}', f'{z:.4f}', _facing(m.T_map_marker[:3, 2]),
-            f'{1e3 * sigma[0]:.2f}', f'{np.rad2deg(sigma[1]):.3f}', f'{m.reprojection_error_px:.3f}',
+            f'{sigma_mm:.2f}', f'{sigma_deg:.3f}', f'{m.reprojection_error_px:.3f}',
             str(m.observations), status,
         )  # fmt: skip
     show(table)

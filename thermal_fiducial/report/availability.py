@@ -46,20 +46,15 @@ class Available:
 
     def _spread(self, chosen: BoolArray) -> dict[str, dict[str, float]]:
         return {
-            name: spread(errors[chosen])
+            name: _figures(errors[chosen])
             for name, errors in (('fused', self.fused), ('markers', self.markers))
             if chosen.any()
         }
 
 
-def spread(errors: FloatArray) -> dict[str, float]:
-    """Root mean square, 95 % and largest of errors (N, 2) [m, rad], in mm and deg."""
-    result = {}
-    for name, values in (('position_{}_mm', 1e3 * errors[:, 0]), ('attitude_{}_deg', np.rad2deg(errors[:, 1]))):
-        result[name.format('rms')] = float(np.sqrt(np.mean(values**2)))
-        result[name.format('p95')] = float(np.percentile(values, 95))
-        result[name.format('max')] = float(values.max())
-    return result
+def _figures(errors: FloatArray) -> dict[str, float]:
+    """Figures of errors (N, 2) [m, rad], in mm and deg."""
+    return metrics.spread(1e3 * errors[:, 0], np.rad2deg(errors[:, 1]), ('rms', 'p95', 'max'))
 
 
 def available(run: Run) -> Available | None:
@@ -100,8 +95,8 @@ def at_frames(run: Run) -> dict[str, dict[str, float]] | None:
     if not both.any():
         return None
     return {
-        'fused': spread(_errors(T_fused[both], T_true[both])),
-        'markers': spread(_errors(run.fiducial.T_map_body[both], T_true[both])),
+        'fused': _figures(_errors(T_fused[both], T_true[both])),
+        'markers': _figures(_errors(run.fiducial.T_map_body[both], T_true[both])),
     }
 
 

@@ -1,6 +1,5 @@
 """Errors of a map against the true one, per marker."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +7,7 @@ import numpy as np
 from thermal_fiducial.core.geometry.se3 import so3_log
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.report.metrics import rigid_residuals
+from thermal_fiducial.report.metrics import rigid_residuals, rms, spread
 
 #: Fewest markers whose residuals after a rigid alignment are meaningful.
 _FEWEST_TO_ALIGN = 4
@@ -69,18 +68,12 @@ def map_accuracy(estimate: MarkerMap, truth: MarkerMap) -> dict[str, float]:
         raise InputError('the two maps have no marker in common')
     free = [error for error in errors.values() if not error.fixed] or list(errors.values())
     result: dict[str, float] = {'markers': len(errors), 'not_fixed': sum(not error.fixed for error in errors.values())}
-    for name, values in (('position_{}_mm', [e.position_mm for e in free]), ('attitude_{}_deg', _angles(free))):
-        result[name.format('rms')] = float(np.sqrt(np.mean(np.square(values))))
-        result[name.format('max')] = float(np.max(values))
+    position, attitude = np.array([(error.position_mm, error.attitude_deg) for error in free]).T
+    result |= spread(position, attitude, ('rms', 'max'))
     claimed = [error.nees for error in free if error.nees is not None]
     if claimed:
         result['nees_per_dof'] = float(np.mean(claimed))
     if len(errors) >= _FEWEST_TO_ALIGN:
         places = [np.array([m.markers[key].T_map_marker[:3, 3] for key in errors]) for m in (estimate, truth)]
-        residuals = np.linalg.norm(rigid_residuals(*places), axis=1)
-        result['position_aligned_rms_mm'] = 1e3 * float(np.sqrt(np.mean(residuals**2)))
+        result['position_aligned_rms_mm'] = 1e3 * rms(np.linalg.norm(rigid_residuals(*places), axis=1))
     return result
-
-
-def _angles(errors: Sequence[MarkerError]) -> list[float]:
-    return [error.attitude_deg for error in errors]

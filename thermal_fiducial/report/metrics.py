@@ -9,7 +9,10 @@ error); S. Umeyama, "Least-squares estimation of transformation parameters", 199
 "Estimation with applications to tracking and navigation", 2001, 5.4 (NEES).
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -91,22 +94,25 @@ def accuracy(e: Errors) -> dict[str, float]:
     if not len(e):
         return {}
     return {
-        **_spread('position', 'mm', 1e3 * e.position_m),
-        **_spread('attitude', 'deg', e.attitude_deg),
-        'position_aligned_rms_mm': 1e3 * _rms(np.linalg.norm(aligned_residuals(e), axis=1)),
+        **spread(1e3 * e.position_m, e.attitude_deg, ('rms', 'median', 'p95', 'max')),
+        'position_aligned_rms_mm': 1e3 * rms(np.linalg.norm(aligned_residuals(e), axis=1)),
     }
 
 
-def _spread(name: str, unit: str, values: FloatArray) -> dict[str, float]:
-    return {
-        f'{name}_rms_{unit}': _rms(values),
-        f'{name}_median_{unit}': float(np.median(values)),
-        f'{name}_p95_{unit}': float(np.percentile(values, 95)),
-        f'{name}_max_{unit}': float(values.max()),
+def spread(position_mm: FloatArray, attitude_deg: FloatArray, kinds: Sequence[str]) -> dict[str, float]:
+    """Figures of errors in position and attitude; ``kinds`` are some of rms, median, p95 (95 %) and max."""
+    measures: dict[str, Callable[[FloatArray], Any]] = {
+        'rms': rms,
+        'median': np.median,
+        'p95': partial(np.percentile, q=95),
+        'max': np.max,
     }
+    errors = (('position', 'mm', position_mm), ('attitude', 'deg', attitude_deg))
+    return {f'{name}_{kind}_{unit}': float(measures[kind](values)) for name, unit, values in errors for kind in kinds}
 
 
-def _rms(values: FloatArray) -> float:
+def rms(values: FloatArray) -> float:
+    """Root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -140,9 +146,9 @@ def jitter(e: Errors) -> dict[str, float]:
     turned = so3_log(so3_exp(e.d[j, 3:]) @ np.swapaxes(so3_exp(e.d[i, 3:]), 1, 2))
     moved = np.linalg.norm(e.d[j, :3] - e.d[i, :3], axis=1)
     return {
-        'position_mm': 1e3 * _rms(moved),
+        'position_mm': 1e3 * rms(moved),
         'position_p95_mm': 1e3 * float(np.percentile(moved, 95)),
-        'attitude_deg': float(np.rad2deg(_rms(np.linalg.norm(turned, axis=1)))),
+        'attitude_deg': float(np.rad2deg(rms(np.linalg.norm(turned, axis=1)))),
     }
 
 
@@ -156,8 +162,8 @@ def relative_pose_error(e: Errors) -> dict[str, float]:
     E = inverse(true_step) @ step
     return {
         'interval_s': RELATIVE_NS / SECOND_NS,
-        'position_mm': 1e3 * _rms(np.linalg.norm(E[:, :3, 3], axis=1)),
-        'attitude_deg': float(np.rad2deg(_rms(np.linalg.norm(so3_log(E[:, :3, :3]), axis=1)))),
+        'position_mm': 1e3 * rms(np.linalg.norm(E[:, :3, 3], axis=1)),
+        'attitude_deg': float(np.rad2deg(rms(np.linalg.norm(so3_log(E[:, :3, :3]), axis=1)))),
     }
 
 

@@ -94,6 +94,7 @@ def test_a_table_that_fits_the_window_stays_within_it(monkeypatch):
         (['replay', 'nope.mcap', '--out', 'run', '--no-report'], 'nope.mcap: no such bag'),
         (['replay', 'nope.mcap', '--out', 'run', '--rate', '2'], '--rate has no effect without --transport processes'),
         (['calibrate', 'intrinsics', 'nope'], 'nope: no such folder of pictures, bag or CSV file'),
+        (['calibrate', 'intrinsics', 'run'], 'run: no pictures'),
         (['evaluate', 'nope'], 'nope: no such run folder'),
         (['evaluate', 'a.txt'], 'a.txt: is a file, not a run folder'),
         (['import', 'a.txt', '--out', 'bag'], 'a.txt: is a file, not a folder'),
