@@ -9,13 +9,13 @@ from functools import cached_property
 import numpy as np
 from scipy.stats import chi2
 
+from support.flights import rms
 from thermal_fiducial.config import ImuNoise, MarkerMapperConfig, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import (
     inverse,
     quaternion_from_rotation,
-    rotation_angle,
     skew,
     so3_exp,
     so3_log,
@@ -361,13 +361,3 @@ def jitter_mm(poses, longest_ns=75_000_000):
     even = (np.abs(steps[1:] - steps[:-1]) < 2_000_000) & (steps[1:] < longest_ns)
     # Of white noise, a second difference has six times the variance.
     return 1e3 * rms(np.linalg.norm(p[2:] - 2.0 * p[1:-1] + p[:-2], axis=1)[even]) / np.sqrt(6.0)
-
-
-def attitude_errors(poses, flight):
-    """(N,) [rad]."""
-    truth = flight.truth(poses.stamps_ns)
-    return rotation_angle(np.swapaxes(truth[:, :3, :3], -1, -2) @ poses.T_map_body[:, :3, :3])
-
-
-def rms(values) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -73,16 +73,6 @@ def camera_poses(views, lens, board):
     return result
 
 
-def residuals_px(views, lens, board):
-    """Distances of all corners from their predictions."""
-    each = []
-    for seen, pixels in zip(views.points, views.pixels, strict=True):
-        pose = _pose(board[seen], pixels, lens)
-        predicted = cv2.projectPoints(board[seen], pose[:3], pose[3:], lens.K, lens.D)[0].reshape(-1, 2)
-        each.append(np.linalg.norm(pixels - predicted, axis=1))
-    return np.concatenate(each)
-
-
 def _pose(points, pixels, lens):
     """Rotation vector and translation (6,) of the board in the camera."""
     _, turn, shift = cv2.solvePnP(points, pixels, lens.K, lens.D, flags=cv2.SOLVEPNP_SQPNP)

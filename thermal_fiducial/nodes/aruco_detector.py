@@ -40,7 +40,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         self._others = OtherDetections(self, self.config, self.fault)
         self._annotated = self.advertise(Image, 'thermal/image_markers', qos.IMAGE_OUTPUT)
         self._images = self.subscribe_newest(Image, 'thermal/image', self._on_image, qos.IMAGE_INPUT, raw=True)
-        self.follow_hints()
+        self.subscribe_to_camera_and_filter()
         self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED).regular = False
 
     def _make_detector(self) -> MarkerDetector | None:
@@ -69,6 +69,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         if self._annotated.listeners:
             gray = self.view(counts.astype(np.uint16, copy=False))
             self._annotated.send(convert.image(display.annotated(gray, markers), head))
+        # If the camera's clock is known, the filter runs: earlier frames had markers of our dictionary.
         if self.odometry.clock_is_known:
             self._dictionaries.settle()
         self._dictionaries.look(image.stamp_ns, counts, self.camera(), any_seen=self._seen > 0)

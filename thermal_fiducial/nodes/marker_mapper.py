@@ -32,7 +32,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._topics = MapTopics(self)
         self._frames = self.subscribe_newest(PointCloud2, 'markers', self._on_markers, qos.RESULT, raw=True)
         self._poses = CameraPoses(self, self.mapper)
-        self.follow_hints()
+        self.subscribe_to_camera_and_filter()
         self._publish_map()
         self._topics.draw(self.mapper.map, self._result.in_view, 0)
 

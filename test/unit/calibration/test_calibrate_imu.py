@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support import small_bag
+from support.flights import rms
 import yaml
 
 pytest.importorskip('allantools')
@@ -35,10 +36,6 @@ def at_rest(seconds, noise=TRUE, seed=0):
 
 def track(times, values):
     return ImuTrack(times, values[:, :3], values[:, 3:])
-
-
-def rms(values):
-    return float(np.sqrt(np.mean(np.square(values))))
 
 
 def test_densities_of_a_long_recording():

@@ -126,9 +126,6 @@ def test_a_file_that_does_not_fit_stays_as_it_was(tmp_path):
     assert (path.read_bytes(), list(tmp_path.iterdir())) == (before, [path])
 
 
-MAKE = ['markers', 'make', '--ids', '1', '--formats']
-
-
 # As with bags, of reportlab.
 @pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
 @pytest.mark.parametrize(

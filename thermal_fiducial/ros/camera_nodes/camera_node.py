@@ -29,8 +29,11 @@ class CameraStageNode(StageNode[Config]):
         #: the filter's latest states
         self.odometry = MotionPrior(self.config.camera_time_offset, self._read_odometry)
 
-    def follow_hints(self) -> None:
-        """Subscribe to calibration and odometry; call it after subscribing to the node's main input."""
+    def subscribe_to_camera_and_filter(self) -> None:
+        """Subscribe to what is known of the camera, and to odometry and clock of the filter.
+
+        Call it after subscribing to the node's main input.
+        """
         self.subscribe_lazily(CameraInfo, 'thermal/camera_info', self._calibration.take, qos.CAMERA_INPUT)
         self.subscribe_lazily(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT)
         RobotFrames(self)

@@ -32,7 +32,9 @@ _LONGEST_NAME = 100
 
 
 class RobotFrames:
-    """Subscribes to ``/tf_static`` and ``robot_description``; create it after the node's main input.
+    """Subscribes to ``/tf_static`` and ``robot_description``, and configures the node with the poses found there.
+
+    Create it after the node's main input; its subscriptions keep it alive.
 
     Parameters
     ----------

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 ODOMETRY_TOPIC, BRIDGE_TOPIC = 'odometry on', 'flight controller on'
 #: Largest deviation of a quaternion's norm from 1.
 NORM_TOLERANCE = 0.1
+
 # --- stamps, headers, poses ---------------------------------------------------------------------------
 
 
