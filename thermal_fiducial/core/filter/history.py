@@ -25,7 +25,15 @@ from thermal_fiducial.core.filter.hypotheses import (
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import TWO_POSES, WINDOW_SECONDS
 from thermal_fiducial.core.filter.propagation import propagated, random_walks
-from thermal_fiducial.core.filter.state import Estimate, POSE, SIZE, VELOCITY
+from thermal_fiducial.core.filter.state import (
+    clock_offset_derivative,
+    embedded_core,
+    Estimate,
+    POSE,
+    SIZE,
+    TIME_OFFSET,
+    VELOCITY,
+)
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
 from thermal_fiducial.core.measurements import CameraPose, Condition
 from thermal_fiducial.core.types import SECOND_NS
@@ -38,6 +46,8 @@ _STEP_OR_LOSS = 0.5
 #: Share of the unusual steps between samples that are steps of all clocks, or of the IMU's by 35 ms and more: at all
 #: recorded gaps samples were lost.
 _STEPS = 0.1
+#: Error coordinates of 1 s of clock offset alone.
+_OF_CLOCK_OFFSET = np.eye(SIZE)[TIME_OFFSET]
 _stamp = attrgetter('stamp_ns')
 
 
@@ -300,10 +310,12 @@ class History:
         time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
         estimate = self._carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate
         if step_ns := self._camera_steps.get(pose.stamp_ns, 0):
-            estimate = estimate.after_camera_step(step_ns / SECOND_NS)
+            estimate = estimate.widened(_OF_CLOCK_OFFSET, step_ns / SECOND_NS)
         for begin_ns, std in self._clock_steps:
             if hypothesis.compared_ns <= begin_ns < estimate.stamp_ns:
-                estimate = estimate.after_clock_steps(self.imu.at(estimate.stamp_ns), std)
+                # Time did not pass.
+                derivative = estimate.state.derivative(self.imu.at(estimate.stamp_ns))
+                estimate = estimate.widened(embedded_core(derivative), std)
         motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)
         measured = body_pose(pose, estimate.state.T_body_camera, self.config.pose_noise_scale)
         return innovation_of(self.config, estimate, measured, motion)
@@ -318,7 +330,9 @@ class History:
                 continue
             if begin_ns > estimate.stamp_ns:
                 estimate = propagated(estimate, self.imu.steps(estimate.stamp_ns, begin_ns), begin_ns, self.walks)
-            estimate = estimate.after_imu_step(self.imu.at(begin_ns), std)
+            # State and stamp of the IMU no longer belong together; the state at the camera's stamps stays the same.
+            derivative = estimate.state.derivative(self.imu.at(begin_ns))
+            estimate = estimate.widened(clock_offset_derivative(derivative), std)
         steps = self.imu.steps(estimate.stamp_ns, until_ns)
         return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self.walks))
 

@@ -83,8 +83,8 @@ def start(
     if settled is None:
         return TWO_POSES
     pose = settled
-    if _contradicts_gravity(pose, imu, config.gravity):
-        return no_gravity(imu)
+    if (contradiction := _contradiction_of_gravity(pose, imu, config.gravity)) is not None:
+        return contradiction
     noise = PoseNoise.of(pose, config.stamp_jitter, config.mount_vibration)
     P = np.diag(_initial_variances(config))
     P[SYSTEMATIC, SYSTEMATIC] = config.systematic_pose_std**2 * pose.shape
@@ -135,17 +135,14 @@ def settled_by_gravity(pose: BodyPose, imu: FloatArray) -> BodyPose | None:
     return replace(pose, T_map_body=T, covariance=0.5 * (P + P.T)) if known else None
 
 
-def _contradicts_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -> bool:
-    """Whether direction or size of the mean specific force of samples (N, 6) contradict ``gravity`` [m/s^2]."""
+def _contradiction_of_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -> Condition | None:
+    """That the mean specific force of samples (N, 6) is not ``gravity`` [m/s^2] in direction or size; None if it is."""
     up, force = pose.T_map_body[2, :3], imu.mean(axis=0)[3:]
     size = float(np.linalg.norm(force))
-    return bool(up @ force < math.cos(LARGEST_TILT) * size) or abs(size - gravity) > HARDLY_GRAVITY * gravity
-
-
-def no_gravity(imu: FloatArray) -> Condition:
-    """What a first pose that contradicts gravity shows; ``imu``: samples (N, 6) up to its instant."""
-    force = ' '.join(f'{value:.1f}' for value in imu.mean(axis=0)[3:])
-    details = f'the IMU says {force} m/s^2; its axes, sign, units? camera_orientation?'
+    if up @ force >= math.cos(LARGEST_TILT) * size and abs(size - gravity) <= HARDLY_GRAVITY * gravity:
+        return None
+    measured = ' '.join(f'{value:.1f}' for value in force)
+    details = f'the IMU says {measured} m/s^2; its axes, sign, units? camera_orientation?'
     return Condition('poses contradict gravity', details)
 
 

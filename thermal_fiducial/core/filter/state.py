@@ -145,32 +145,8 @@ class Estimate:
     #: noise of the camera poses, as adapted to the innovations
     pose_noise: PoseNoise
 
-    def after_camera_step(self, std: float) -> 'Estimate':
-        """The estimate after an unknown step of the camera's clock, of standard deviation ``std`` [s]."""
-        covariance = self.covariance.copy()
-        covariance[TIME_OFFSET, TIME_OFFSET] += std**2
-        return replace(self, covariance=covariance)
-
-    def after_imu_step(self, imu: FloatArray, std: float) -> 'Estimate':
-        """The estimate after an unknown step of the IMU's clock.
-
-        The clock offset changes, and state and stamp of the IMU no longer belong together. Poses do not show it at
-        once, as the state at their stamps stays the same.
-
-        Parameters
-        ----------
-        imu : (6,) the sample before it
-        std : standard deviation of the step [s]
-        """
-        error = clock_offset_derivative(self.state.derivative(imu))
-        return replace(self, covariance=self.covariance + std**2 * np.outer(error, error))
-
-    def after_clock_steps(self, imu: FloatArray, std: float) -> 'Estimate':
-        """The estimate after an unknown step of all clocks, of standard deviation ``std`` [s]: time did not pass.
-
-        ``imu`` (6,): the latest sample.
-        """
-        error = embedded_core(self.state.derivative(imu))
+    def widened(self, error: FloatArray, std: float) -> 'Estimate':
+        """The estimate with an unknown multiple of an ``error`` (54,), of standard deviation ``std``."""
         return replace(self, covariance=self.covariance + std**2 * np.outer(error, error))
 
     def std(self, place: slice | int) -> float:
