@@ -10,7 +10,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros.base import qos
-from thermal_fiducial.ros.base.node import StageNode, WARN
+from thermal_fiducial.ros.base.node import StageNode
 from thermal_fiducial.ros.filter_node.filter_memory import FilterMemory
 from thermal_fiducial.ros.filter_node.filter_outputs import FilterOutputs
 from thermal_fiducial.ros.filter_node.filter_status import FilterStatus
@@ -78,10 +78,8 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._memory.save(self.filter)
 
     def state(self) -> tuple[bytes, str]:
-        """Level and message: status of the filter, reason of the last refusal, delay; an unknown frame of the IMU."""
-        level, words = self._status.state()
-        doubt = self._frames.doubt
-        return (max(level, WARN), f'{words}; {doubt}') if doubt else (level, words)
+        """Level and message: status of the filter, reason of the last refusal, delay, unknown frame of the IMU."""
+        return self._status.state(self._frames.doubt)
 
     def headline(self) -> str:
         """Status of the filter without numbers."""

@@ -49,10 +49,11 @@ class FilterStatus:
             self._apart_s = (update.stamp_ns - self._imu_ns) / SECOND_NS
         self._last_refusal = '' if update.accepted or update.pending else update.reason
 
-    def state(self) -> tuple[bytes, str]:
-        """Diagnostic level and message: state of the filter, reason of the last refusal, delay."""
+    def state(self, doubt: str) -> tuple[bytes, str]:
+        """Diagnostic level and message: state of the filter, reason of the last refusal, delay, ``doubt`` of frames."""
         level, words = self._state_of_filter()
-        return max(level, self._imu.level()), _joined(words, self._imu.complaint())
+        level = max(level, self._imu.level(), WARN if doubt else OK)
+        return level, _joined(_joined(words, self._imu.complaint()), doubt)
 
     def _state_of_filter(self) -> tuple[bytes, str]:
         condition, lost = self._condition(), self._filter.lost
