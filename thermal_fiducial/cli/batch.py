@@ -2,12 +2,11 @@
 
 import argparse
 from pathlib import Path
-import sys
 
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import PROCESSES
-from thermal_fiducial.cli.subcommands import add_remap, whole_number
+from thermal_fiducial.cli.subcommands import add_remap, warn, whole_number
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import parse_remaps
@@ -66,14 +65,10 @@ def run(args: argparse.Namespace) -> int:
     camera = batch.check()
     count = min(args.workers, len(args.bags))
     with batch.cleared_up(), workers(count, args.scheduler) as client, progress_bar('batch') as progress:
-        summary = run_batch(batch, camera, client, progress, _warn)
+        summary = run_batch(batch, camera, client, progress, warn)
     runs = number_of(len(summary['runs']), 'run')
     print(
         f'{args.out}: {runs}; {number_of(len(summary["markers"]), "marker")} in the joint map, '
         f'{summary["frames_used"]} of {summary["frames"]} frames used'
     )
     return 0
-
-
-def _warn(line: str) -> None:
-    print(f'warning: {line}', file=sys.stderr)

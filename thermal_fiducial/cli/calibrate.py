@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +15,7 @@ from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.cli.ranges import IMU_NOISE
-from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite
+from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite, warn
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
@@ -184,7 +183,7 @@ def _warn_of_wide(position: float, orientation: float) -> None:
         return
     known = _in_words(position, orientation)
     usual = _in_words(_USUAL.extrinsics_position_std, _USUAL.extrinsics_orientation_std)
-    print(f'warning: extrinsics known to {known} only, {usual} are usual: {_REMEDY}', file=sys.stderr)
+    warn(f'extrinsics known to {known} only, {usual} are usual: {_REMEDY}')
 
 
 def _in_words(position: float, orientation: float) -> str:

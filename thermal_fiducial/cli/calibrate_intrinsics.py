@@ -4,10 +4,8 @@ import argparse
 from collections.abc import Sequence
 import math
 from pathlib import Path
-import sys
 
 import numpy as np
-import yaml
 
 from thermal_fiducial.calibration.intrinsics import Calibration
 from thermal_fiducial.calibration.lens_check import image_error, ImageError
@@ -19,7 +17,14 @@ from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pi
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.ranges import BOARD_MM, BOARD_POINTS, FOCAL_PX, IMAGE_PX, MORE_POINTS
-from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite, whole_number
+from thermal_fiducial.cli.subcommands import (
+    add_force,
+    add_remap,
+    file_to_write,
+    refuse_to_overwrite,
+    warn,
+    whole_number,
+)
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.mapping.map_data import MarkerMap
@@ -28,8 +33,8 @@ from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.plain_yaml import save_plain
 from thermal_fiducial.files.reading import naming
-from thermal_fiducial.files.writing import write_text
 
 _SHADES = ' .:+#'
 #: Boards; ``circles`` are OpenCV's asymmetric grid.
@@ -224,7 +229,7 @@ def _save_covariance(out: Path, result: Calibration, error: ImageError) -> None:
         'sigma_covered_px': error.inside_px,
         'sigma_not_covered_px': error.outside_px,
     }
-    write_text(_covariance_file(out), yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
+    save_plain(_covariance_file(out), document)
 
 
 def _covariance_file(out: Path) -> Path:
@@ -238,7 +243,7 @@ def _warn_of_focal_length(result: Calibration) -> None:
     if share > usual:
         known = f'focal length known to {100.0 * share:.2g} % only, {100.0 * usual:.2g} % is usual'
         remedy = f'tilt the board by 20 to 40 degrees, or set focal_length_std: {share:.4f}'
-        print(f'warning: {known}: {remedy}', file=sys.stderr)
+        warn(f'{known}: {remedy}')
 
 
 def _warn_of_principal_point(result: Calibration) -> None:
@@ -252,7 +257,7 @@ def _warn_of_principal_point(result: Calibration) -> None:
     if turn > usual:
         known = f'principal point known to {point:.2g} px only, which may turn the camera by {1e3 * turn:.2g} mrad'
         remedy = f'more views, or set extrinsics_orientation_std: {math.hypot(turn, usual):.4f}'
-        print(f'warning: {known}: {remedy}', file=sys.stderr)
+        warn(f'{known}: {remedy}')
 
 
 def _print_result(

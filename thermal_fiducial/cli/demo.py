@@ -12,7 +12,7 @@ from thermal_fiducial.cli.evaluate import make_video, print_tables
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.ranges import FLIGHT_S
-from thermal_fiducial.cli.subcommands import whole_number
+from thermal_fiducial.cli.subcommands import warn, whole_number
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.packages import is_installed, require_plots
 from thermal_fiducial.report.page import evaluate_run, Evaluation, require_packages, write_page
@@ -121,7 +121,7 @@ def _replay(bag: Path, out: Path) -> None:
 
     options = Options(bag=bag, run=out, params=bag / 'params.yaml', map_file=bag / 'map_one.yaml')
     with _step('2/3 replaying it through the four nodes') as share:
-        replay(options, share, lambda line: print(f'warning: {line}', file=sys.stderr))
+        replay(options, share, warn)
     print('3/3 scoring', file=sys.stderr)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 import re
-import sys
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from thermal_fiducial.cli.run_parameters import (
     size_std_of_run,
     sizes_of_run,
 )
-from thermal_fiducial.cli.subcommands import file_to_write, whole_number
+from thermal_fiducial.cli.subcommands import file_to_write, warn, whole_number
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
@@ -142,7 +141,7 @@ def _refine(args: argparse.Namespace) -> int:
 def _warn_of_other_dictionary(args: argparse.Namespace, start: MarkerMap) -> None:
     of_run = dictionary_of_run(args.run_folder)
     if of_run and (other := other_patterns(start.markers, start.dictionary, of_run, args.map.parent)):
-        print(f'warning: {args.map} and {args.run_folder}: {other}', file=sys.stderr)
+        warn(f'{args.map} and {args.run_folder}: {other}')
 
 
 def _only_size(marker_map: MarkerMap) -> float | None:

@@ -5,7 +5,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from shlex import quote
-import sys
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import BOARD_POINTS, CELLS, LENGTH_MM
-from thermal_fiducial.cli.subcommands import add_force, refuse_to_overwrite
+from thermal_fiducial.cli.subcommands import add_force, refuse_to_overwrite, warn
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
@@ -199,14 +198,14 @@ def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cel
     if options.quiet_cells < 1.0:
         # doc/accuracy.md: the detector takes the warm surface for one that ends a cell outside the marker.
         ring = f'a warm ring of {options.quiet_cells:g} cells is too narrow'
-        print(f'warning: {ring}: markers are measured too small, by 1 % at 0.7; 1 or more', file=sys.stderr)
+        warn(f'{ring}: markers are measured too small, by 1 % at 0.7; 1 or more')
     cells = cells or chosen(args)[0].shape[1] + 2
     with progress_bar('measuring webs') as progress:
         for done, drawing in enumerate(drawings, 1):
             strength = strength_of(drawing, options, cells, args.min_web)
             print(f'marker {drawing.name}: narrowest web {strength.web_mm:.1f} mm ({strength.kind})')
             for complaint in strength.complaints:
-                print(f'warning: marker {drawing.name}: {complaint}', file=sys.stderr)
+                warn(f'marker {drawing.name}: {complaint}')
             progress(done / len(drawings))
 
 

@@ -10,7 +10,7 @@ from thermal_fiducial.cli.evaluate import make_video
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import RATE
-from thermal_fiducial.cli.subcommands import add_remap
+from thermal_fiducial.cli.subcommands import add_remap, warn
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, parse_remaps
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         print(f'{args.out}: replacing the earlier run there')
     started = time.monotonic()
     with progress_bar(f'replay {args.bag.name}') as progress:
-        summary = replay(options, progress, _warn, _say)
+        summary = replay(options, progress, warn, _say)
     seconds = time.monotonic() - started
     out = summary['messages_out']
     print(
@@ -144,10 +144,6 @@ def _internal_errors(diagnostics: Mapping[str, Mapping[str, str]]) -> list[str]:
     """Internal errors of the nodes: a node goes on after one, but its results are incomplete."""
     last = {node: figures.get('last refusal', '') for node, figures in diagnostics.items()}
     return [f'{node}: {reason}' for node, reason in last.items() if reason.startswith(INTERNAL_ERROR)]
-
-
-def _warn(line: str) -> None:
-    print(f'warning: {line}', file=sys.stderr)
 
 
 def _say(line: str) -> None:

@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Callable, Iterable, Sequence
 import math
 from pathlib import Path
+import sys
 
 from thermal_fiducial.core.wording import listed
 from thermal_fiducial.errors import InputError
@@ -53,6 +54,11 @@ def number(least: float, most: float, unit: str = '') -> Callable[[str], float]:
         return value
 
     return within
+
+
+def warn(line: str) -> None:
+    """Print a warning to standard error."""
+    print(f'warning: {line}', file=sys.stderr)
 
 
 def require_unit(option: str, quaternion: Sequence[float]) -> None:

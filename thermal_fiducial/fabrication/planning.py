@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.geometry import se3
@@ -26,9 +25,8 @@ from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
 from thermal_fiducial.core.geometry.reprojection import marker_corners, narrow_sides
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.plain_yaml import load_plain, save_plain
 from thermal_fiducial.files.reading import one_line
-from thermal_fiducial.files.writing import write_text
 
 FORMAT = 'thermal_fiducial/marker_measurements'
 #: The measurements in the package.
@@ -168,7 +166,7 @@ def save_measurements(path: str | os.PathLike[str], measurements: Measurements, 
     document: dict[str, Any] = {'format': FORMAT, **notes}
     for name in _TABLES:
         document[name] = np.round(getattr(measurements, name), 6).tolist()
-    write_text(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
+    save_plain(path, document)
 
 
 @dataclass(frozen=True)

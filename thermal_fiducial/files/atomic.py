@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 import errno
 import fcntl
+import glob
 import os
 from pathlib import Path
 import tempfile
@@ -57,7 +58,7 @@ def sync_folder(folder: Path) -> None:
 def clean_up(path: Path) -> None:
     """Remove temporary files of killed writers of ``path``; only under :func:`locked`."""
     path = _target(path)
-    for litter in path.parent.glob(f'.{_literal(path.name)}.*.tmp'):
+    for litter in path.parent.glob(f'.{glob.escape(path.name)}.*.tmp'):
         litter.unlink(missing_ok=True)
 
 
@@ -106,8 +107,3 @@ def _target(path: Path) -> Path:
         return path.resolve()
     except RuntimeError:
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP)) from None
-
-
-def _literal(name: str) -> str:
-    """``name`` as a glob pattern that matches only itself."""
-    return ''.join(f'[{character}]' if character in '*?[' else character for character in name)

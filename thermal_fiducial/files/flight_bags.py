@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
@@ -24,9 +23,9 @@ from thermal_fiducial.files.bags import (
     TRUTH_TOPIC,
 )
 from thermal_fiducial.files.images import read_gray
+from thermal_fiducial.files.plain_yaml import save_plain
 from thermal_fiducial.files.recordings import Corners, Recording
 from thermal_fiducial.files.rig_files import Rig
-from thermal_fiducial.files.writing import write_text
 
 _Event = tuple[int, str, Any]
 
@@ -63,8 +62,7 @@ def write_recording(
             bag.write(topic, max(stamp_ns, 0), message)
             if topic in (IMAGE_TOPIC, MARKERS_TOPIC, CAMERA_POSE_TOPIC):
                 progress(1)
-        text = yaml.safe_dump(parameters, sort_keys=False, default_flow_style=None, width=120)
-        write_text(out / 'params.yaml', text)
+        save_plain(out / 'params.yaml', parameters)
 
 
 def frame_count(recording: Recording) -> int:

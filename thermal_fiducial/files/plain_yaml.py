@@ -3,6 +3,7 @@
 The text passes the checks of :mod:`thermal_fiducial.files.schema` first: no aliases, no tags, limited depth and size.
 """
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import yaml
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import one_line, read_text
 from thermal_fiducial.files.schema import parse_yaml
+from thermal_fiducial.files.writing import write_text
 
 
 def load_plain(path: str | Path) -> Any:
@@ -29,6 +31,11 @@ def load_plain(path: str | Path) -> Any:
         raise InputError(f'{path}: not valid YAML: {one_line(error)}') from None
     _check_integers(str(path), document)
     return document
+
+
+def save_plain(path: str | os.PathLike[str], document: Any) -> None:
+    """Write plain objects in the order given, lists of numbers on one line."""
+    write_text(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
 
 
 def _check_integers(path: str, value: Any) -> None:

@@ -15,13 +15,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-import yaml
 
 from thermal_fiducial.core.types import IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, TRUTH_TOPIC
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry
+from thermal_fiducial.files.plain_yaml import save_plain
 from thermal_fiducial.files.rosbags_types import MAP_FRAME
 from thermal_fiducial.files.trajectory_file import save_tum
 from thermal_fiducial.files.work_folders import made_whole
@@ -248,11 +248,7 @@ def write_side_files(folder: Path, flight: FlightPlan) -> None:
     save_tum(folder / 'ground_truth.tum', stamps.tolist(), motion.position, motion.rotation.as_quat())
     write_text(folder / 'map_true.yaml', _marker_map(scenario, scenario.markers))
     write_text(folder / 'map_one.yaml', _marker_map(scenario, scenario.markers[:1]))
-    _dump(folder / 'params.yaml', {'/**': {'ros__parameters': _parameters(scenario)}})
-
-
-def _dump(path: Path, content: dict[str, Any]) -> None:
-    write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
+    save_plain(folder / 'params.yaml', {'/**': {'ros__parameters': _parameters(scenario)}})
 
 
 def _marker_map(scenario: Scenario, markers: tuple[Marker, ...]) -> str:
