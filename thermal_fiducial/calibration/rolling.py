@@ -107,18 +107,13 @@ class FrameCorners:
             np.einsum('nij,nik->jk', moved, moved),
             np.einsum('nij,ni->j', moved, rho * weight[:, None]),
         )
-        off = (W @ corner_errors(self.corners_px, camera)).reshape(-1, 2, DRAWS + 1) * weight[:, None, None]
+        off = (W @ corner_errors(self.corners_px, camera)).reshape(-1, 2, DRAWS) * weight[:, None, None]
         return moments, np.einsum('nij,nik->jk', J, off)
 
 
 def corner_errors(corners: FloatArray, camera: Camera) -> FloatArray:
-    """Errors (N, 4, 2, K) [px] of corners (N, 4, 2) by a standard deviation of each of K of the calibration.
-
-    Of its lens, whose covariance draws have, and of its focal length.
-    """
-    of_lens = LensErrors(corners, camera, _ERRORS).drawn() / np.sqrt(DRAWS)
-    of_focal_length = _ERRORS.focal_length_std * (corners - camera.principal_point)
-    return np.concatenate([of_lens, of_focal_length[..., None]], axis=-1)
+    """Errors (N, 4, 2, K) [px] of corners (N, 4, 2) whose sum of squares is the variance by lens and focal length."""
+    return np.asarray(LensErrors(corners, camera, _ERRORS).drawn() / np.sqrt(DRAWS))
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ class SystematicErrors:
     #: cutter's kerf of 0.3 mm is 0.1 %. Enters poses from markers, new markers and the map (:func:`scale_of_map`).
     marker_size_std: float = 0.003
     #: Relative error of the focal length: a calibration with a board is good to 0.1 to 0.3 %. It moves the camera along
-    #: its axis by as much of the distance to the markers, in maps with exact sizes too. Enters poses from markers and
-    #: new markers.
+    #: its axis by as much of the distance to the markers, in maps with exact sizes too. Enters with the errors of the
+    #: lens (``LensErrors``), in poses from markers as part of the map's error.
     focal_length_std: float = 0.002
     #: Error of the ratio of the two focal lengths [share of the difference between them]: pixels are square, so all of
     #: the difference is an error of the calibration (0.3 % in a published one, of a camera whose corners show none). By

@@ -1,4 +1,4 @@
-"""Errors of a lens model: a smooth function of the place in the image, the same in all frames, and of its aspect ratio.
+"""Errors of a camera model: a smooth function of the place in the image, the same in all frames, and focal lengths.
 
 A Gaussian process with a squared exponential covariance, the same for either axis, by its values at nodes over the
 image (J. Quinonero-Candela, C. Rasmussen, "A Unifying View of Sparse Approximate Gaussian Process
@@ -33,20 +33,25 @@ class LensErrors:
         #: (..., I) factors of independent variables of variance one, for errors of 1 px
         self.modes: FloatArray = (columns[..., :, None] * rows[..., None, :]).reshape(*corners.shape[:-1], -1)
         self._px, self._camera = errors.corner_px, camera
-        #: (..., 2) by one standard deviation of the aspect ratio [px]
-        self._of_aspect: FloatArray = errors.aspect * camera.aspect_error * (corners - camera.principal_point)
+        arms = corners - camera.principal_point
+        #: (..., 2) by one standard deviation of the focal length, and of the aspect ratio [px]
+        self.of_focal_length: FloatArray = errors.focal_length_std * arms
+        self._of_aspect: FloatArray = errors.aspect * camera.aspect_error * arms
 
     def covariance(self, gains: FloatArray) -> FloatArray:
         """Covariance (m, m) of what has derivatives ``gains`` (n, m, 2) [1/px] by the corners."""
         mixed = np.tensordot(self.modes.reshape(len(gains), -1), self._px * gains, axes=([0], [0]))
-        of_aspect = np.tensordot(self._of_aspect.reshape(-1, 2), gains, axes=([0, 1], [0, 2]))
-        return np.asarray(np.tensordot(mixed, mixed, axes=([0, 2], [0, 2])) + np.outer(of_aspect, of_aspect))
+        lengths = np.stack([self.of_focal_length.reshape(-1, 2), self._of_aspect.reshape(-1, 2)])
+        of_lengths = np.tensordot(gains, lengths, axes=([0, 2], [1, 2]))
+        return np.asarray(np.tensordot(mixed, mixed, axes=([0, 2], [0, 2])) + of_lengths @ of_lengths.T)
 
     def drawn(self, chosen: slice = slice(None)) -> FloatArray:
         """The errors (..., 2, k) [px] in the ``chosen`` ones of :data:`DRAWS` draws."""
-        lens, aspect = _variables(crc32(np.ascontiguousarray(self._camera.K).tobytes()), self.modes.shape[-1])
+        seed = crc32(np.ascontiguousarray(self._camera.K).tobytes())
+        lens, (focal_length, aspect) = _variables(seed, self.modes.shape[-1])
         smooth = np.tensordot(self.modes, self._px * lens[..., chosen], axes=1)
-        return np.asarray(smooth + self._of_aspect[..., None] * aspect[chosen])
+        of_lengths = self.of_focal_length[..., None] * focal_length[chosen]
+        return np.asarray(smooth + of_lengths + self._of_aspect[..., None] * aspect[chosen])
 
 
 def _modes(places: FloatArray, size: int, length: float) -> FloatArray:
@@ -65,9 +70,9 @@ def _nodes(size: int, length: float) -> tuple[FloatArray, FloatArray]:
 
 @lru_cache(maxsize=_CAMERAS)
 def _variables(seed: int, modes: int) -> tuple[FloatArray, FloatArray]:
-    """Variables (modes, 2, DRAWS) and (DRAWS,) of a camera, of variance one; uncorrelated as far as there are draws."""
-    count = 2 * modes + 1
+    """Variables (modes, 2, DRAWS), (2, DRAWS) of a camera, of variance one; uncorrelated as far as there are draws."""
+    count = 2 * modes + 2
     most, fewest = max(count, DRAWS), min(count, DRAWS)
     axes = np.linalg.qr(np.random.default_rng(seed).standard_normal((most, fewest)))[0]
     variables = np.sqrt(most) * (axes.T if fewest < DRAWS else axes)
-    return variables[:-1].reshape(modes, 2, DRAWS), variables[-1]
+    return variables[:-2].reshape(modes, 2, DRAWS), variables[-2:]

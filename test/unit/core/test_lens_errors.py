@@ -9,7 +9,7 @@ from support.walls import CAMERA
 from thermal_fiducial.core.error_model import covariance_by_draws, DRAWS, SystematicErrors
 from thermal_fiducial.core.lens_errors import LensErrors
 
-ERRORS = SystematicErrors(corner_px=0.2)
+ERRORS = SystematicErrors(corner_px=0.2, focal_length_std=0.0)
 
 
 def correlations(corners, length):
@@ -82,3 +82,17 @@ def test_half_of_what_the_focal_lengths_differ_by_is_an_error_of_either():
 def test_pixels_that_are_square_or_clearly_not_have_no_error_of_their_aspect_ratio(across):
     lens = LensErrors(np.full((1, 2), 100.0), of_focal_lengths(400.0, across), replace(ERRORS, corner_px=0.0))
     assert not lens.drawn().any()
+
+
+def test_one_focal_length_is_wrong_for_all_corners():
+    """By 1 %: away from the principal point, one draw for all of them."""
+    corners = np.array([[420.0, 256.0], [320.0, 356.0], [220.0, 56.0]])
+    errors = replace(ERRORS, corner_px=0.0, focal_length_std=0.01)
+    lens, expected = LensErrors(corners, of_focal_lengths(400.0, 400.0), errors), 0.01 * (corners - [320.0, 256.0])
+    draws = lens.drawn()
+    np.testing.assert_allclose(draws, expected[..., None] * draws[0, 0], rtol=0.0, atol=1e-12)
+    # 64 draws, for fewer errors of the camera: each of variance one over all of them.
+    np.testing.assert_allclose(np.mean((draws[0, 0] / expected[0, 0]) ** 2), 1.0, rtol=1e-12)
+    gains = np.random.default_rng(3).normal(size=(3, 6, 2))
+    moved = np.einsum('iau,iu->a', gains, expected)
+    np.testing.assert_allclose(lens.covariance(gains), np.outer(moved, moved), rtol=0.0, atol=1e-12)

@@ -8,6 +8,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import (
     block_diagonal,
     covariance_by_draws,
+    covariance_of_one_error,
     decision_weights,
     diagonal_blocks,
     drawn_sum,
@@ -126,19 +127,19 @@ class JointFit:
         map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ reprojection.J_marker
         # Sides of the markers and distances in the map have the same scale error.
         of_scale = np.einsum('nij,nj->i', map_gains[:, :, :3], sight.scale_arms) - grown
-        # A longer focal length moves all corners away from the principal point.
-        of_focal = gains @ (sight.observed.corners - self.camera.principal_point).ravel()
-        of_scales = np.stack([model.marker_size_std * of_scale, model.focal_length_std * of_focal], axis=-1)
-        of_map = of_scales @ of_scales.T
+        of_sides = model.marker_size_std * of_scale
+        of_map = covariance_of_one_error(of_sides)
         if np.any(sight.map_covariances):
             of_map += covariance_by_draws(drawn_sum(map_gains, sight.draws))
         covariance = white + lens.covariance(by_corner) + of_map
         if not np.all(np.isfinite(covariance)):
             return None
+        # Wrong for as long as the map is: no mean over poses removes it.
+        of_map += covariance_of_one_error(gains @ lens.of_focal_length.ravel())
         ids, rms_px = tuple(sight.observed.ids.tolist()), math.sqrt(reprojection.errors_px @ reprojection.errors_px / n)
         T = retract(T_map_camera, step)
         pose = CameraPose(self.stamp_ns, T, covariance, of_map, ids, rms_px)
-        return Location(pose, sight, reprojection, weights, map_gains, lens, white, of_scales, by_corner)
+        return Location(pose, sight, reprojection, weights, map_gains, lens, white, of_sides, by_corner)
 
     def decisive_weights(self, found: Location) -> FloatArray:
         """Weights (N,) of the markers against odometry: with the bias of corners, and residuals above their claims."""

@@ -114,10 +114,9 @@ class Location:
     map_gains: FloatArray
     #: errors of the lens at the corners (N, 4)
     lens: LensErrors
-    #: (6, 6) part of the covariance by noise of the corners, and (6, 2) errors by one standard deviation of the scales,
-    #: of map and lens
+    #: (6, 6) part of the covariance by noise of the corners, and (6,) the error by one standard deviation of the sides
     noise: FloatArray
-    of_scales: FloatArray
+    of_sides: FloatArray
     #: (4 N, 6, 2) derivative of the pose by each corner [1/px]
     corner_gains: FloatArray
     #: whether no other pose is possible
@@ -143,7 +142,7 @@ class Location:
             pose=replace(self.pose, T_map_camera=T, covariance=own + of_map, map_covariance=of_map),
             map_gains=with_map @ self.map_gains,
             noise=with_camera @ (self.noise + unknown) @ with_camera.T,
-            of_scales=with_camera @ self.of_scales,
+            of_sides=with_camera @ self.of_sides,
             corner_gains=with_camera @ self.corner_gains,
         )
 
@@ -152,7 +151,7 @@ class Location:
         """The camera as viewpoint of new markers: all but its noise is common to all views."""
         of_corners = self.lens.drawn().reshape(-1, 2, DRAWS)
         draws = drawn_sum(self.corner_gains, of_corners) + drawn_sum(self.map_gains, self.sight.draws)
-        return Viewpoint.known(self.pose.T_map_camera, self.noise, draws, self.of_scales)
+        return Viewpoint.known(self.pose.T_map_camera, self.noise, draws, self.of_sides)
 
 
 @dataclass(frozen=True)

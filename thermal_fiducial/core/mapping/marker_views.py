@@ -9,6 +9,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import (
     block_diagonal,
     covariance_by_draws,
+    covariance_of_one_error,
     drawn_sum,
     DRAWS,
     independent_sum,
@@ -21,8 +22,8 @@ from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.types import FloatArray, IntArray
 
-#: Of a camera pose that no scale has moved.
-NO_SCALES: FloatArray = np.zeros((6, 2))
+#: Of a camera pose that no error of the sides has moved.
+NOT_MOVED: FloatArray = np.zeros(6)
 #: Poses nearer to each other than this [rad] are one pose, and not the two of a planar ambiguity.
 SAME_POSE = np.deg2rad(2.0)
 # A corner that moves faster in the image than this is hardly before the camera at all [px/m, px/rad].
@@ -43,8 +44,8 @@ class Viewpoint:
     covariances: FloatArray
     #: (2, 6, K) joint draws of either's error that other views share: it moves the marker, but leaves no residual
     draws: FloatArray
-    #: (6, 2) displacements of the camera by one standard deviation of the scales, of map and lens
-    scales: FloatArray
+    #: (6,) displacement of the camera by one standard deviation of the markers' sides
+    of_sides: FloatArray
     #: (2,) of the known markers' residuals from either: how likely it is
     chi2: FloatArray
 
@@ -60,10 +61,11 @@ class Viewpoint:
 
     @classmethod
     def known(
-        cls, T_map_camera: FloatArray, covariance: FloatArray, draws: FloatArray, scales: FloatArray = NO_SCALES
+        cls, T_map_camera: FloatArray, covariance: FloatArray, draws: FloatArray, of_sides: FloatArray = NOT_MOVED
     ) -> 'Viewpoint':
         """A unique camera pose (4, 4): covariance (6, 6) of its own error, draws (6, K) of the one that views share."""
-        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2), np.stack([draws] * 2), scales, np.zeros(2))
+        T, covariances, both_draws = (np.stack([of_one] * 2) for of_one in (T_map_camera, covariance, draws))
+        return cls(T, covariances, both_draws, of_sides, np.zeros(2))
 
     @classmethod
     def either(cls, first: 'Viewpoint', second: 'Viewpoint', chi2: FloatArray) -> 'Viewpoint':
@@ -72,7 +74,7 @@ class Viewpoint:
             np.stack([first.T_map_camera[0], second.T_map_camera[0]]),
             np.stack([first.covariances[0], second.covariances[0]]),
             np.stack([first.draws[0], second.draws[0]]),
-            first.scales,
+            first.of_sides,
             chi2,
         )
 
@@ -150,7 +152,7 @@ class MarkerViews:
         self._uncertain = block_diagonal(with_corner_errors(covariances, SystematicErrors()))
         self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
         self._camera_noise = np.stack([view.viewpoint.covariances for view in views])
-        self._scales = np.stack([view.viewpoint.scales for view in views])
+        self._of_sides = np.stack([view.viewpoint.of_sides for view in views])
         self._draws = np.stack([view.viewpoint.draws for view in views])
         # Views whose cameras have a larger error in common than others count less.
         best = np.argmin(np.sum(np.square(self._draws[:, 0]), axis=(1, 2)))
@@ -173,7 +175,7 @@ class MarkerViews:
         return FittedPoses(T[order], chi2[order], cost[order], used[best], begun.W[best])
 
     def errors(self, fits: FittedPoses, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error but for the scales.
+        """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error but for the sides.
 
         The errors are the corners', whose covariance counts ``noise`` times, and those of the cameras' poses.
         """
@@ -184,12 +186,12 @@ class MarkerViews:
         gains = -white @ np.einsum('vri,vrj->vij', J_marker, J_camera)
         by_corner = white @ np.swapaxes(J_marker, -1, -2) @ fits.W
         of_lens = self._of_lens.drawn().reshape(-1, 8, DRAWS)
-        of_scales = drawn_sum(gains, self._scales)
+        of_sides = np.einsum('vij,vj->i', gains, self._of_sides)
         shared = drawn_sum(gains, self._draws[own]) + drawn_sum(by_corner, of_lens)
         alone = independent_sum(by_corner, self._noise) + independent_sum(gains, self._camera_noise[own])
         alone *= noise
         of_noise = np.linalg.cholesky(alone) @ rng.standard_normal((6, DRAWS))
-        return alone + of_scales @ of_scales.T + covariance_by_draws(shared), shared + of_noise
+        return alone + covariance_of_one_error(of_sides) + covariance_by_draws(shared), shared + of_noise
 
     def _choose(self, T: FloatArray) -> IntArray:
         """The likelier of the two camera poses of each view, (S, n), for a marker at T."""

@@ -95,7 +95,7 @@ def placed(*draws, lens_px=0.0):
     candidate = Candidate(7, SIZE)
     for x, own in zip((-0.3, 0.0, 0.3), draws, strict=True):
         candidate.add(seen_from(x, own))
-    return candidate.place(CAMERA, SystematicErrors(corner_px=lens_px))
+    return candidate.place(CAMERA, SystematicErrors(corner_px=lens_px, focal_length_std=0.0))
 
 
 def test_a_new_marker_has_the_errors_of_the_cameras_draw_by_draw():
