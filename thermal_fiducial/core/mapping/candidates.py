@@ -176,6 +176,11 @@ class NewMarkers:
             del self.candidates[min(self.candidates, key=lambda key: self.candidates[key].views[-1].stamp_ns)]
         return placed, {c.id: c.reason for c in shown if c.id in self.candidates}
 
+    @property
+    def stamps_ns(self) -> set[int]:
+        """Stamps of all views."""
+        return {view.stamp_ns for candidate in self.candidates.values() for view in candidate.views}
+
     def move(self, displacement: Displacement) -> None:
         """Apply a displacement of the map to all candidates."""
         for candidate in self.candidates.values():

@@ -160,6 +160,10 @@ class KeyframeStore:
         if len(observed.ids) >= 2:
             self.add(self._keyframe(observed, pose, camera, predicted))
 
+    def settle(self, observed: Observations, pose: CameraPose, camera: Camera) -> None:
+        """Keep an earlier frame, whose camera pose is known only now."""
+        self.add(self._keyframe(observed, pose, camera, None))
+
     def bridge(self, observed: Observations, camera: Camera, predicted: PredictedCamera, *, first: bool) -> Viewpoint:
         """Keep a frame without a known marker; returns the viewpoint of its markers, by odometry.
 

@@ -88,6 +88,8 @@ class MarkerMapper:
         #: the last pose that nothing contradicted
         self._last: CameraPose | None = None
         self._keyframes = KeyframeStore(self.config.keyframe_budget, self.map)
+        #: frames with two possible poses that candidates have views of, by stamp
+        self._doubtful: dict[int, LocatedFrame] = {}
 
     def use_map_of(self, owner: 'MarkerMapper') -> None:
         """Locate in the map of ``owner`` as it is now, and change nothing in it, quarantine included.
@@ -195,7 +197,26 @@ class MarkerMapper:
         placed, waiting = self._new.show(frame.stamp_ns, frame.new, frame.camera, viewpoint, self.errors)
         self.map.markers |= {marker.id: marker for marker in placed}
         self.map.revision += bool(placed)
+        if placed:
+            self._settle([marker.id for marker in placed])
+        if self._doubtful:
+            needed = self._new.stamps_ns
+            self._doubtful = {key: frame for key, frame in self._doubtful.items() if key in needed}
         return bool(placed), waiting
+
+    def _settle(self, placed: list[int]) -> None:
+        """Make keyframes of frames that had two possible poses, where the markers just ``placed`` settle which.
+
+        An adjustment without them would know less of these markers than their placement did.
+        """
+        showing = {key: frame for key, frame in self._doubtful.items() if np.isin(frame.observed.ids, placed).any()}
+        for key, frame in showing.items():
+            own = frame.observed.only(np.isin(frame.observed.ids, list(self.map.markers)))
+            sight = Sight.of(own, self.map)
+            outcome = locate(key, sight.only(sight.trusted), frame.camera, self.errors) if sight.trusted.any() else None
+            if isinstance(outcome, Location) and outcome.settled:
+                self._keyframes.settle(frame.observed, outcome.pose, frame.camera)
+                del self._doubtful[key]
 
     def _without_pose(self, frame: LocatedFrame, refusal: Refusal) -> tuple[bool, Waiting]:
         """Views of new markers from a frame without a pose: with two possible camera poses, or one by odometry."""
@@ -203,6 +224,7 @@ class MarkerMapper:
         if self.frozen or frame.is_known.all():
             return False, {}
         if refusal.viewpoint is not None:
+            self._doubtful[frame.stamp_ns] = frame
             return self._place_new(frame, refusal.viewpoint)
         if predicted is None or not self._keyframes.bridgeable(frame.stamp_ns, longest):
             return False, {}

@@ -161,13 +161,16 @@ class MarkerViews:
         self._chi2_of_cameras = np.stack([view.viewpoint.chi2 for view in views])
 
     def fit(self, starts: FloatArray) -> FittedPoses:
-        """Fits from all initial poses (S, 4, 4); of two possible camera poses the likelier one is used."""
+        """Fits from all initial poses (S, 4, 4); of two possible camera poses the likelier one is used.
+
+        At least twice: with weights from a start some degrees off, a camera's turn that nothing shows counts in part.
+        """
         T, chosen = starts, self._choose(starts)
-        for _ in range(_CHOICES):
+        for attempt in range(_CHOICES):
             begun = self._weights(T, chosen)
             T, chi2 = self._minimised(T, chosen, begun)
             used, chosen = chosen, self._choose(T)
-            if np.array_equal(used, chosen):
+            if attempt and np.array_equal(used, chosen):
                 break
         cost = chi2 + np.sum(begun.constants, axis=-1)
         order = np.argsort(cost, kind='stable')

@@ -308,6 +308,26 @@ def test_markers_settle_each_other_where_each_alone_is_in_doubt():
         assert np.linalg.norm(difference(m.map.markers[i].T_map_marker, T)[3:]) < np.deg2rad(5.0)
 
 
+def test_an_adjustment_has_the_views_that_a_marker_was_placed_by():
+    """Two small markers far away, of which neither alone gives a pose: the frames have two until the second enters."""
+    rng = np.random.default_rng(3)
+    poses = {i: T for i, T in wall(rng, 8, tilt=0.0).items() if i in (0, 1)}
+    centre, m, k = np.mean([T[:3, 3] for T in poses.values()], axis=0), from_one_marker(poses), 0
+    while 1 not in m.map.markers:
+        bearing = 0.5 + 0.3 * np.sin(k / 40)
+        T = look(centre + 5.0 * np.array([-np.cos(bearing), np.sin(bearing), 0.1]), centre)
+        assert 'ambiguity' in m.process(stamp(k), see(T, poses, 0.15, rng), CAMERA).reason
+        k += 5
+    placed = m.map.markers[1]
+    assert m.refine() is not None
+    refined = m.map.markers[1]
+    # The same views: 1.3 times the variance, as the adjustment counts the markers' shapes, too.
+    assert refined.covariance.trace() < 1.5 * placed.covariance.trace()
+    error = difference(poses[1], refined.T_map_marker)
+    # Chi square of six degrees of freedom exceeds it once in a thousand.
+    assert error @ np.linalg.solve(refined.covariance, error) < 22.5
+
+
 def test_a_candidate_that_moves_never_enters():
     rng = np.random.default_rng(6)
     poses = wall(rng)
