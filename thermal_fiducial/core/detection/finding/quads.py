@@ -2,7 +2,8 @@
 
 The threshold is a share of the local standard deviation, so that markers of any contrast are found. Below a floor of
 the order of the noise it rises again: a marker of twice the noise is still segmented, a bare wall hardly at all. It is
-estimated by mean absolute deviations: of squares, a flame or a lamp beside a marker would be nearly all.
+estimated by mean absolute deviations, none of which counts for more than a marker's: of squares, or without that bound,
+a flame or a lamp beside a marker would be nearly all.
 """
 
 import math
@@ -23,8 +24,9 @@ _SPECKS = 3
 # In a picture for a display: odd width of the surroundings, no wider than the white around the smallest markers; least
 # difference of a dark pixel from their mean [gray levels] and [standard deviations of the noise].
 _PICTURE_WINDOW_PX, _PICTURE_STEP, _PICTURE_NOISE = 5, 3.0, 2.0
-# Floor of the local standard deviation where all markers have a high contrast [standard deviations of the noise].
-_FLOOR_OF_CLEAR = 4.0
+# Where all markers have a high contrast: floor of the local standard deviation, largest deviation that counts for it
+# [standard deviations of the noise].
+_FLOOR_OF_CLEAR, _MOST_OF_CLEAR = 4.0, 300.0
 # Tolerance of polygon approximation as a share of an outline's length: above the effect of noise, below a side.
 _STRAIGHT = 0.05
 _CORNERS = 4
@@ -55,6 +57,8 @@ class Scale(NamedTuple):
     depth: float
     #: local standard deviation below which the threshold rises again, in standard deviations of the pixel noise
     floor: float
+    #: largest deviation that counts for the local standard deviation, in standard deviations of the pixel noise
+    most: float
 
 
 class DarkRegions:
@@ -85,8 +89,9 @@ class DarkRegions:
         window = scale.window_px, scale.window_px
         limit = cv2.blur(self._smooth if scale.window_shrink == 1 else coarse, window)
         small = halved(coarse)
-        deviation = small - cv2.blur(small, (_LOCAL, _LOCAL))
-        spread = np.maximum(_STD_OF_MEAN * cv2.blur(np.abs(deviation), (_LOCAL, _LOCAL)), TINY)
+        most = (_MOST_OF_CLEAR if clear else scale.most) * noise
+        deviation = np.minimum(cv2.absdiff(small, cv2.blur(small, (_LOCAL, _LOCAL))), most)
+        spread = np.maximum(_STD_OF_MEAN * cv2.blur(deviation, (_LOCAL, _LOCAL)), TINY)
         floor = (_FLOOR_OF_CLEAR if clear else scale.floor) * noise
         asked = scale.depth * (spread + floor * floor / spread)
         cv2.subtract(limit, cv2.resize(asked, limit.shape[::-1], interpolation=cv2.INTER_LINEAR), dst=limit)

@@ -23,8 +23,8 @@ from thermal_fiducial.core.pixel_noise import with_columns_corrected
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.
-_FINE = Scale(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5)
-_FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0)
+_FINE = Scale(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5, most=60.0)
+_FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0, most=40.0)
 # Correlation from which an outline needs no alignment; least correlation, and its margin, for alignment to be tried.
 _CLEAR = 0.95
 _HINT, _HINT_MARGIN = 0.6, 0.06
