@@ -46,6 +46,21 @@ class CornerBias:
         #: the last frame, and its corners
         self._last: tuple[Location, _FittedCorners] | None = None
 
+    def at_first(self, location: Location) -> float:
+        """Standard deviation of the bias [px] for the pose of a frame, before any pair of frames has shown it.
+
+        All of a single frame's residuals beyond the noise that the corners claim counts as bias, as nothing shows yet
+        whether it lasts. Later frames have ``px``.
+        """
+        noise, fitted = location.sight.noise_px, _FittedCorners.of(location)
+        if self._sums.any() or len(noise) < FEWEST_MARKERS:
+            return self.px
+        squares = (location.reprojection.residuals**2).mean(axis=(1, 2))
+        bound = np.minimum(1.0, INCONSISTENT_PX / np.sqrt(np.maximum(squares, TINY)))
+        shown, _ = shown_errors(fitted, fitted, np.repeat(bound, 8))
+        claimed = shown.own * float(fitted.shares**2 @ noise**2) / len(noise)
+        return _learned(self.px, shown.smooth_variance(claimed), 1.0)
+
     def add(self, location: Location) -> None:
         """Update with the residuals of a located frame."""
         before, self._last = self._last, (location, _FittedCorners.of(location))

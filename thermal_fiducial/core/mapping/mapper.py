@@ -128,8 +128,11 @@ class MarkerMapper:
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.sizes):
             odometry, last = (None, self._last_at(stamp_ns)) if predicted is None else (predicted.pose, None)
-            fit = partial(locate, stamp_ns, camera=camera, model=self.errors, odometry=odometry, last=last)
-            outcome = from_consistent_markers(sight, camera, predicted, fit)
+            fit = partial(locate, stamp_ns, camera=camera, odometry=odometry, last=last)
+            outcome = from_consistent_markers(sight, camera, predicted, partial(fit, model=self.errors))
+            if isinstance(outcome, Location) and (px := self._bias.at_first(outcome)) > self._bias.px:
+                model = replace(self.errors, corner_px=px)
+                outcome = from_consistent_markers(sight, camera, predicted, partial(fit, model=model))
         elif len(known.sizes):
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
