@@ -36,22 +36,22 @@ HEAD = [
 ]
 
 
-def test_fused_beside_markers_alone(benchmark, write_table):
+def test_fused_beside_markers_alone(benchmark, write_recorded):
     """On maps taken for exact; over the carpet that of an adjustment of the same flight's corners."""
     boards = [real_flights.april_board(camera) for camera in ('cam0', 'cam1')]
     benchmark.pedantic(fly, args=(boards[0],), rounds=1)
     flights = [*boards, *map(real_flights.carpet, real_flights.CARPETS)]
-    write_table('real_flights', [HEAD, *(cells(fly(flight)) for flight in flights)])
+    write_recorded('real_flights', [HEAD, *(cells(fly(flight)) for flight in flights)])
 
 
-def test_simulated_flights_made_like_them(benchmark, write_table):
+def test_simulated_flights_made_like_them(benchmark, write_recorded):
     """What the simulator says in the recordings' place: where it is kinder, it has to be made more like them."""
     flights = [simulated(name, seed) for name in ('april', 'cheap_imu') for seed in range(3)]
     benchmark.pedantic(fly, args=(flights[-1],), rounds=1)
-    write_table('flights_like_real', [HEAD, *(cells(fly(flight)) for flight in flights)])
+    write_recorded('flights_like_real', [HEAD, *(cells(fly(flight)) for flight in flights)])
 
 
-def test_maps_of_the_carpet(benchmark, write_table):
+def test_maps_of_the_carpet(benchmark, write_recorded):
     """A map of one flight by our mapper against an adjustment of its corners, and the other flight on it."""
     flights = [real_flights.carpet(name) for name in real_flights.CARPETS]
     benchmark.pedantic(fly, args=(flights[0],), rounds=1)
@@ -61,10 +61,10 @@ def test_maps_of_the_carpet(benchmark, write_table):
         error = real_flights.map_error_mm(run.marker_map, flight.marker_map)
         on_map = fly(other, run.marker_map)
         rows.append([flight.name, f'{len(run.marker_map.markers)}', f'{error:.1f} mm', *cells(on_map)])
-    write_table('real_maps', rows)
+    write_recorded('real_maps', rows)
 
 
-def test_without_frames(benchmark, write_table):
+def test_without_frames(benchmark, write_recorded):
     """Frames left out for a second or two, anywhere in the flight: the error at the end, and what is claimed there."""
     rows = [['flight', 'no frames for', 'goal', 'error: rms, 95 %, worst', 'within 3 sigma', 'claimed over true']]
     flights = [real_flights.april_board(camera) for camera in ('cam0', 'cam1')]
@@ -84,4 +84,4 @@ def test_without_frames(benchmark, write_table):
                     f'{gaps.claimed_over_true:.2f}',
                 ]
             )
-    write_table('real_coasting', rows)
+    write_recorded('real_coasting', rows)
