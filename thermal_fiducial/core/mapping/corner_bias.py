@@ -52,12 +52,11 @@ class CornerBias:
         All of a single frame's residuals beyond the noise that the corners claim counts as bias, as nothing shows yet
         whether it lasts. Later frames have ``px``.
         """
-        noise, fitted = location.sight.noise_px, _FittedCorners.of(location)
+        noise = location.sight.noise_px
         if self._sums.any() or len(noise) < FEWEST_MARKERS:
             return self.px
-        squares = (location.reprojection.residuals**2).mean(axis=(1, 2))
-        bound = np.minimum(1.0, INCONSISTENT_PX / np.sqrt(np.maximum(squares, TINY)))
-        shown, _ = shown_errors(fitted, fitted, np.repeat(bound, 8))
+        fitted, squares = _FittedCorners.of(location), (location.reprojection.residuals**2).mean(axis=(1, 2))
+        shown, _ = shown_errors(fitted, fitted, _bounds(squares, INCONSISTENT_PX))
         claimed = shown.own * float(fitted.shares**2 @ noise**2) / len(noise)
         return _learned(self.px, shown.smooth_variance(claimed), 1.0)
 
@@ -79,9 +78,8 @@ class CornerBias:
         fitted, former_fitted = self._last[1].only(now), before[1].only(then)
         shares = fitted.shares * former_fitted.shares
         # Residuals of moved or mistaken markers are correlated too.
-        limit = min(INCONSISTENT_PX, BIAS_OUTLIER * self.px) ** 2
-        bound = np.minimum(1.0, limit / np.maximum(np.abs(products), TINY))
-        shown, common = shown_errors(fitted, former_fitted, np.repeat(np.sqrt(bound), 8))
+        bounds = _bounds(products, min(INCONSISTENT_PX, BIAS_OUTLIER * self.px))
+        shown, common = shown_errors(fitted, former_fitted, bounds)
         known = shown.own * float(shares @ location.sight.observed.detector_px[now] ** 2) / len(now)
         sums = common * np.array((shares.mean(), known, *shown))
         self._sums = BIAS_MEMORY * self._sums + (1.0, of_shape.mean() / SHAPE_VISIBLE, *sums)
@@ -90,6 +88,11 @@ class CornerBias:
         self.px = _learned(prior.corner_px, ShownErrors(*sums_shown).smooth_variance(known), weight)
         # Not all that lasts until the next frame is alike in all views: the shape is never more than at first.
         self.shape = min(_learned(prior.marker_shape, shapes / frames, frames), prior.marker_shape)
+
+
+def _bounds(products: FloatArray, largest_px: float) -> FloatArray:
+    """(8 N,) weights of residuals by which no marker's mean product (N,) [px^2] exceeds the square of the largest."""
+    return np.repeat(np.sqrt(np.minimum(1.0, largest_px**2 / np.maximum(np.abs(products), TINY))), 8)
 
 
 def _learned(prior: float, variance: float, frames: float) -> float:

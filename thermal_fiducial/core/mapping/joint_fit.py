@@ -134,11 +134,11 @@ class JointFit:
         covariance = white + lens.covariance(by_corner) + of_map
         if not np.all(np.isfinite(covariance)):
             return None
-        # Wrong for as long as the map is: no mean over poses removes it.
-        of_map += covariance_of_one_error(gains @ lens.of_focal_length.ravel())
+        # Part of the lens's covariance, and wrong for as long as the map is: no mean over poses removes it.
+        map_covariance = of_map + covariance_of_one_error(gains @ lens.of_focal_length.ravel())
         ids, rms_px = tuple(sight.observed.ids.tolist()), math.sqrt(reprojection.errors_px @ reprojection.errors_px / n)
         T = retract(T_map_camera, step)
-        pose = CameraPose(self.stamp_ns, T, covariance, of_map, ids, rms_px)
+        pose = CameraPose(self.stamp_ns, T, covariance, map_covariance, ids, rms_px)
         return Location(pose, sight, reprojection, weights, map_gains, lens, white, of_sides, by_corner)
 
     def decisive_weights(self, found: Location) -> FloatArray:

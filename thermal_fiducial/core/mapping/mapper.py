@@ -29,7 +29,7 @@ from thermal_fiducial.core.mapping.map_data import jump, MapMarker, MapperResult
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
-from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
 
 #: Reason for which the map is not updated from a frame with a pose.
 CONTRADICTED = 'the known markers in view contradict the odometry'
@@ -119,9 +119,7 @@ class MarkerMapper:
         """First half of :meth:`process`, up to the pose, which can be published before the map is updated."""
         observed = Observations.of(markers)
         # Step 2: known and new markers.
-        is_known = np.array([key in self.map.markers for key in observed.ids.tolist()], dtype=np.bool_)
-        own = observed if is_known.all() else observed.only(is_known)
-        known = Sight.of(own, self.map)
+        is_known, known = self._in_map(observed)
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
         sight = known if known.trusted.all() else known.only(known.trusted)
@@ -139,6 +137,11 @@ class MarkerMapper:
             outcome = Refusal('the map has no marker: give a map file with at least one')
         frame = LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome)
         return self._consistency.checked(frame)
+
+    def _in_map(self, observed: Observations) -> tuple[BoolArray, Sight]:
+        """Which of N markers are in the map, (N,), and these with their entries."""
+        is_known = np.array([key in self.map.markers for key in observed.ids.tolist()], dtype=np.bool_)
+        return is_known, Sight.of(observed if is_known.all() else observed.only(is_known), self.map)
 
     def _last_at(self, stamp_ns: int) -> CameraPose | None:
         """The last pose for a frame that follows soon, uncertain by what a robot may have turned since."""
@@ -214,9 +217,8 @@ class MarkerMapper:
         """
         showing = {key: frame for key, frame in self._doubtful.items() if np.isin(frame.observed.ids, placed).any()}
         for key, frame in showing.items():
-            own = frame.observed.only(np.isin(frame.observed.ids, list(self.map.markers)))
-            sight = Sight.of(own, self.map)
-            outcome = locate(key, sight.only(sight.trusted), frame.camera, self.errors) if sight.trusted.any() else None
+            _, known = self._in_map(frame.observed)
+            outcome = locate(key, known.only(known.trusted), frame.camera, self.errors)
             if isinstance(outcome, Location) and outcome.settled:
                 self._keyframes.settle(frame.observed, outcome.pose, frame.camera)
                 del self._doubtful[key]
