@@ -14,3 +14,9 @@ def listed(names: Iterable[object], most: int = sys.maxsize) -> str:
     words = [str(name) for name in names]
     more = f' and {len(words) - most} more' if len(words) > most else ''
     return ', '.join(words[:most]) + more
+
+
+def marker_names(ids: Iterable[int], most: int = sys.maxsize) -> str:
+    """Markers by their IDs, as :func:`listed`: "marker 1", "markers 1, 2 and 3 more"."""
+    known = list(ids)
+    return f'{"marker" if len(known) == 1 else "markers"} {listed(known, most)}'

@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.wording import listed
+from thermal_fiducial.core.wording import marker_names
 
 #: Re-projection error of a marker above which some views are outliers [px]; these have little weight in its pose.
 LARGE_PX = 2.0
@@ -89,7 +89,7 @@ def _far_groups(markers: Sequence[MapMarker]) -> list[Doubt]:
     for group in set(range(count)) - {int(np.argmax(np.bincount(groups)))}:
         inside = groups == group
         ids = [markers[k].id for k in np.flatnonzero(inside).tolist()]
-        names = f'{"marker" if len(ids) == 1 else "markers"} {listed(ids, _MOST_NAMES)}'
+        names = marker_names(ids, _MOST_NAMES)
         far = float(apart[inside][:, ~inside].min())
         found.append(
             Doubt(f'{names}: {far:.0f} m from all others, no camera sees both: positions are in metres', False)

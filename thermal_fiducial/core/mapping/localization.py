@@ -19,6 +19,7 @@ from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.wording import marker_names
 
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.
 _PROPOSERS = 4
@@ -171,5 +172,4 @@ def _hypotheses(sight: Sight, prior: CameraPose | None) -> FloatArray:
 
 def names(sight: Sight) -> str:
     """The markers of a frame, in words."""
-    ids = sight.observed.ids.tolist()
-    return f'marker {ids[0]}' if len(ids) == 1 else 'markers ' + ', '.join(str(i) for i in ids)
+    return marker_names(sight.observed.ids.tolist())

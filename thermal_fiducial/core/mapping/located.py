@@ -28,6 +28,7 @@ from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Observations, VAGUE
 from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked
+from thermal_fiducial.core.wording import listed
 
 #: Squared Mahalanobis distance (6 d.o.f.) beyond which markers and odometry contradict each other: ten sigma.
 CONTRADICTION = 100.0
@@ -214,8 +215,7 @@ class LocatedFrame:
         std = self.outcome.rotation_std
         if self.predicted is not None or std <= VAGUE:
             return ''
-        listed = ', '.join(str(key) for key in self.outcome.pose.marker_ids)
-        return f'known to {math.degrees(std):.0f} degrees only, by marker {listed}'
+        return f'known to {math.degrees(std):.0f} degrees only, by marker {listed(self.outcome.pose.marker_ids)}'
 
     @property
     def new(self) -> Observations:

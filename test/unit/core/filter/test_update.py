@@ -13,6 +13,7 @@ from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_t
 from thermal_fiducial.core.filter.state import (
     clock_offset_derivative,
     CORE,
+    embedded_core,
     EXTRINSICS,
     MARKERS,
     POSE,
@@ -489,3 +490,13 @@ def test_a_step_of_the_clock_of_the_imu_does_not_show_in_the_next_pose(estimate,
         np.sqrt(np.diag(added)[POSITION]), 0.01 * np.abs(estimate.state.velocity_body), rtol=1e-9
     )
     assert added[TIME_OFFSET, TIME_OFFSET] == pytest.approx(1e-4)
+
+
+def test_a_step_of_all_clocks_shows_in_the_next_pose(estimate, motion):
+    """The state is unknown along the motion, the clock offset as known as before."""
+    before = replace(estimate, covariance=1e-6 * np.eye(SIZE))
+    derivative = estimate.state.derivative(motion.imu)
+    added = before.widened(embedded_core(derivative), 0.01).covariance - before.covariance
+    moved = 0.01 * derivative
+    np.testing.assert_allclose(added[CORE, CORE], np.outer(moved, moved), atol=1e-12)
+    assert not added[TIME_OFFSET].any()
