@@ -122,12 +122,18 @@ def constants(path: Path) -> int:
 
 
 def repeated_names() -> list[str]:
-    """Names of classes and modules that stand more than once in the package, were it with an underscore before them."""
+    """Names of classes, types and modules that stand more than once in the package, were it with an underscore before.
+
+    Types are names of a module that begin with a capital letter and are no constants.
+    """
     names: Counter[str] = Counter(path.stem for path in sources(PACKAGE))
     for path in sources(PACKAGE):
-        names.update(
-            node.name.lstrip('_') for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef)
-        )
+        tree = ast.parse(path.read_text())
+        names.update(node.name.lstrip('_') for node in ast.walk(tree) if isinstance(node, ast.ClassDef))
+        assigned = [node for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign)]
+        targets = [node.target if isinstance(node, ast.AnnAssign) else node.targets[0] for node in assigned]
+        types = [target.id.lstrip('_') for target in targets if isinstance(target, ast.Name)]
+        names.update(name for name in types if name[:1].isupper() and not name.isupper())
     return sorted(f'{name} x{count}' for name, count in names.items() if count > 1)
 
 

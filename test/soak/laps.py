@@ -19,8 +19,7 @@ from thermal_fiducial.files.images import header_stamp_ns
 from thermal_fiducial.ros.messages import convert
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.scenario import named
-from thermal_fiducial.sim.spline_trajectory import Motion
-from thermal_fiducial.sim.spline_trajectory import Path as Trajectory
+from thermal_fiducial.sim.spline_trajectory import Motion, MotionPath
 from thermal_fiducial.sim.thermal_camera import FlightPlan, plan, START_NS
 from thermal_fiducial.sim.writer import IMU_DELAY_NS, write_flight
 
@@ -41,7 +40,7 @@ def lap(*, small: bool = False) -> FlightPlan:
 class Repeated:
     """A trajectory that ends at rest where it began, again and again."""
 
-    once: Trajectory
+    once: MotionPath
     period: float
 
     def __call__(self, t: np.ndarray) -> Motion:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.calibration.keypoints import Keypoints
-from thermal_fiducial.calibration.lattice import Grower, Node
+from thermal_fiducial.calibration.lattice import Grower, LatticeNode
 from thermal_fiducial.calibration.placement import BoardNodes, GridPlacement, GridRefusal
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -63,7 +63,7 @@ class GridSearch:
     _alike: float = 0.0
     _placed: float = 0.0
 
-    def add(self, grower: Grower, grid: dict[Node, int], board: BoardNodes) -> bool:
+    def add(self, grower: Grower, grid: dict[LatticeNode, int], board: BoardNodes) -> bool:
         """Weigh a grid; returns whether it is like the board."""
         index = list(grid.values())
         pixels, weight = grower.pixels[index], float(grower.contrast[index].sum())

@@ -18,7 +18,7 @@ from thermal_fiducial.core.types import FloatArray, IntArray
 # Steps from a place to those that show where its point should be.
 _STEPS = tuple(product(range(-REACH, REACH + 1), repeat=2))
 #: Place in a grid, (along its first axis, along its second).
-Node = tuple[int, int]
+LatticeNode = tuple[int, int]
 #: A keypoint, its two neighbours along one axis and the two along another.
 Seed = tuple[int, int, int, int, int]
 
@@ -109,7 +109,7 @@ class Grower:
         """Of the seeds."""
         return float(self.contrast[[seed[0] for seed in self.seeds]].sum())
 
-    def grids(self) -> Iterator[dict[Node, int]]:
+    def grids(self) -> Iterator[dict[LatticeNode, int]]:
         """Keypoints (their index) by their place in a grid, by the order of seeds; those of a grid seed no other."""
         taken: set[int] = set()
         tried = 0
@@ -123,16 +123,16 @@ class Grower:
                 if orderly:
                     yield grid
 
-    def _grow(self, seed: Seed) -> tuple[dict[Node, int], bool]:
+    def _grow(self, seed: Seed) -> tuple[dict[LatticeNode, int], bool]:
         """Grid from a seed: first what is next to it, then over gaps of one point; and whether it is orderly.
 
         Points of noise lie anywhere within the tolerance: their grid is given up.
         """
-        grid: dict[Node, int] = dict(zip(((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)), seed, strict=True))
-        support: Counter[Node] = Counter()
+        grid: dict[LatticeNode, int] = dict(zip(((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)), seed, strict=True))
+        support: Counter[LatticeNode] = Counter()
         for node in grid:
             support.update(_supported(node))
-        asked: dict[Node, int] = {}
+        asked: dict[LatticeNode, int] = {}
         off: list[float] = []
         growing = orderly = True
         while growing and orderly:
@@ -141,7 +141,12 @@ class Grower:
         return grid, orderly
 
     def _add(
-        self, grid: dict[Node, int], reach: int, support: Counter[Node], asked: dict[Node, int], off: list[float]
+        self,
+        grid: dict[LatticeNode, int],
+        reach: int,
+        support: Counter[LatticeNode],
+        asked: dict[LatticeNode, int],
+        off: list[float],
     ) -> bool:
         """Add points ``reach`` steps from the grid, all predicted from the present grid; returns whether any was added.
 
@@ -172,7 +177,7 @@ class Grower:
                 off.append(found[1])
         return len(grid) > before
 
-    def _scales_at(self, grid: dict[Node, int], steps: FloatArray) -> FloatArray:
+    def _scales_at(self, grid: dict[LatticeNode, int], steps: FloatArray) -> FloatArray:
         """Search scales (P,) of a grid's points where its ``steps`` (P, 2, 2) are, which grow with them."""
         ends = self.pixels[[grid[node] for node in ((1, 0), (-1, 0), (0, 1), (0, -1))]]
         seed_area = 0.25 * abs(np.linalg.det([ends[0] - ends[1], ends[2] - ends[3]]))
@@ -180,7 +185,7 @@ class Grower:
         return np.asarray(self._scale[grid[0, 0]] - wider / np.log(SCALE_RATIO))
 
     def _next(
-        self, grid: dict[Node, int], node: Node, nearby: list[int], centre: FloatArray, steps: FloatArray
+        self, grid: dict[LatticeNode, int], node: LatticeNode, nearby: list[int], centre: FloatArray, steps: FloatArray
     ) -> tuple[int, float] | None:
         """Keypoint of those ``nearby`` that is at ``node``, expected at ``centre``, and how far it is off [steps].
 
@@ -194,7 +199,7 @@ class Grower:
                 return index, away
         return None
 
-    def _fits(self, grid: dict[Node, int], node: Node, index: int) -> bool:
+    def _fits(self, grid: dict[LatticeNode, int], node: LatticeNode, index: int) -> bool:
         """Whether Hessian and contrast are like those of a neighbour; of any sign, for contrast may reverse."""
         neighbours = next(known for reach in (1, 2) if (known := [grid[n] for n in _around(node, reach) if n in grid]))
         alike = np.abs(self._hessians[neighbours] @ self._hessians[index]) > _LIKE
@@ -207,17 +212,17 @@ def _similar_scales(keypoints: Keypoints, scale: int) -> IntArray:
     return np.flatnonzero(np.abs(keypoints.scale - scale) <= 1)
 
 
-def _around(node: Node, reach: int) -> list[Node]:
+def _around(node: LatticeNode, reach: int) -> list[LatticeNode]:
     a, b = node
     return [(a + reach, b), (a - reach, b), (a, b + reach), (a, b - reach)]
 
 
-def _beside(grid: dict[Node, int], reach: int) -> list[Node]:
+def _beside(grid: dict[LatticeNode, int], reach: int) -> list[LatticeNode]:
     """Places ``reach`` steps from a point of the grid that have none, each once."""
     return list({node: None for known in grid for node in _around(known, reach) if node not in grid})
 
 
-def _supported(node: Node) -> list[Node]:
+def _supported(node: LatticeNode) -> list[LatticeNode]:
     """Places that the point at a ``node`` leads to."""
     a, b = node
     return [(a + i, b + j) for i, j in _STEPS]

@@ -27,7 +27,7 @@ from thermal_fiducial.files.plain_yaml import save_plain
 from thermal_fiducial.files.recordings import Corners, Recording
 from thermal_fiducial.files.rig_files import Rig
 
-_Event = tuple[int, str, Any]
+_Recorded = tuple[int, str, Any]
 
 
 def write_recording(
@@ -70,7 +70,7 @@ def frame_count(recording: Recording) -> int:
     return len(recording.pictures) + len(recording.corners) + len(recording.poses)
 
 
-def _imu(recording: Recording) -> Iterator[_Event]:
+def _imu(recording: Recording) -> Iterator[_Recorded]:
     """IMU samples in recorded order; the recording time of a backward stamp is that of the sample before."""
     arrival_ns = 0
     for sample in recording.samples:
@@ -78,7 +78,7 @@ def _imu(recording: Recording) -> Iterator[_Event]:
         yield arrival_ns, IMU_TOPIC, bag_messages.imu(sample)
 
 
-def _frames(recording: Recording, sigma_px: float, late_ns: int) -> Iterator[_Event]:
+def _frames(recording: Recording, sigma_px: float, late_ns: int) -> Iterator[_Recorded]:
     camera = recording.rig.camera
     for picture in recording.pictures:
         arrival = picture.stamp_ns + late_ns
@@ -99,7 +99,7 @@ def _rows(frame: Corners, rig: Rig, sigma_px: float) -> Markers:
     return rows_from_corners(frame.ids, frame.corners_px, covariances, sizes, rig.camera)
 
 
-def _truth(recording: Recording) -> Iterator[_Event]:
+def _truth(recording: Recording) -> Iterator[_Recorded]:
     if recording.truth is not None:
         for stamp_ns, T_map_body in zip(*recording.truth, strict=True):
             yield int(stamp_ns), TRUTH_TOPIC, bag_messages.truth(int(stamp_ns), T_map_body)

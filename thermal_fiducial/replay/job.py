@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.replay.recorder import Sink
-from thermal_fiducial.replay.topics import Playable, Topics
+from thermal_fiducial.replay.topics import Playable, TopicTypes
 
 #: Longest time without a message that is played as it is [ns]; a computer without a battery for its clock sets it by
 #: years when it finds a network, also in the middle of a recording.
@@ -31,9 +31,9 @@ class ReplayJob:
 
     bag: Playable
     nodes: Sequence[str]
-    played: Topics
+    played: TopicTypes
     files: Sink
-    recorded: Topics
+    recorded: TopicTypes
     ros_arguments: Sequence[str]
     progress: Callable[[int], None]
     warn: Callable[[str], None]

@@ -21,7 +21,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.trajectory_file import tum_line
 from thermal_fiducial.files.writing import claim, is_claimed, unfinished, write_text
-from thermal_fiducial.replay.topics import Topics, type_name
+from thermal_fiducial.replay.topics import TopicTypes, type_name
 from thermal_fiducial.ros.base.counting import CountingNode
 from thermal_fiducial.ros.messages import clouds, convert
 
@@ -55,7 +55,7 @@ class RunFiles:
     topics : topics of ``output`` with their types
     """
 
-    def __init__(self, folder: Path, T_body_camera: FloatArray, topics: Topics) -> None:
+    def __init__(self, folder: Path, T_body_camera: FloatArray, topics: TopicTypes) -> None:
         self.folder = folder
         self._T_camera_body = inverse(T_body_camera)
         self.counts: Counter[str] = Counter()
@@ -152,7 +152,7 @@ class RunFiles:
 class Recorder(CountingNode):
     """Subscribes to the nodes' outputs and passes them on as (topic, bytes)."""
 
-    def __init__(self, take: Callable[[str, bytes], None], topics: Topics, **kwargs: Any) -> None:
+    def __init__(self, take: Callable[[str, bytes], None], topics: TopicTypes, **kwargs: Any) -> None:
         super().__init__('recorder', **kwargs)
         for topic, (kind, profile) in topics.items():
             self.subscribe(kind, topic, partial(take, topic), profile, raw=True)

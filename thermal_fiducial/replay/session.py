@@ -23,7 +23,7 @@ from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
 from thermal_fiducial.replay.recorder import refuse_folder_in_use, RunFiles
 from thermal_fiducial.replay.settings import read_settings, Settings
-from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED, Topics, type_name
+from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED, TopicTypes, type_name
 from thermal_fiducial.ros.process.interrupts import Interrupts
 
 MAP_FILE, SUMMARY_FILE = 'marker_map.yaml', 'summary.json'
@@ -120,7 +120,9 @@ def _bag_of(options: Options) -> BagReader:
     return BagReader(options.bag, options.remaps, second_camera=options.second_camera)
 
 
-def _cast(bag: BagReader, options: Options, settings: Settings) -> tuple[Entry, tuple[str, ...], Topics, Topics]:
+def _cast(
+    bag: BagReader, options: Options, settings: Settings
+) -> tuple[Entry, tuple[str, ...], TopicTypes, TopicTypes]:
     """The stage at which the bag enters, the nodes to run, the topics to play, and the topics to record.
 
     Raises
@@ -134,7 +136,7 @@ def _cast(bag: BagReader, options: Options, settings: Settings) -> tuple[Entry, 
     return entry, nodes, played, recorded
 
 
-def _cast_from(entry: Entry, settings: Settings, *, images: bool) -> tuple[tuple[str, ...], Topics, Topics]:
+def _cast_from(entry: Entry, settings: Settings, *, images: bool) -> tuple[tuple[str, ...], TopicTypes, TopicTypes]:
     """The nodes to run, the topics that the bag must have, and the topics to record.
 
     Raises
@@ -267,7 +269,9 @@ def _why_not(files: RunFiles, topic: str) -> str:
     return next((f': {reason}' for reason in last if reason.startswith(f'{name}: ')), '')
 
 
-def _summary(options: Options, settings: Settings, bag: BagReader, played: Topics, files: RunFiles) -> dict[str, Any]:
+def _summary(
+    options: Options, settings: Settings, bag: BagReader, played: TopicTypes, files: RunFiles
+) -> dict[str, Any]:
     """Figures that need no ground truth, independent of the replay's speed."""
     return {
         'format': 'thermal_fiducial/run',

@@ -23,7 +23,7 @@ from thermal_fiducial.files.bags import (
 )
 from thermal_fiducial.ros.base import qos
 
-Topics: TypeAlias = dict[str, tuple[type, Any]]
+TopicTypes: TypeAlias = dict[str, tuple[type, Any]]
 
 
 class Playable(Protocol):
@@ -37,7 +37,7 @@ class Playable(Protocol):
         """The messages on ``topics`` in their order."""
 
 
-PLAYED: Topics = {
+PLAYED: TopicTypes = {
     IMAGE_TOPIC: (Image, qos.IMAGE_OUTPUT),
     COMPRESSED_TOPIC: (CompressedImage, qos.IMAGE_OUTPUT),
     CAMERA_INFO_TOPIC: (CameraInfo, qos.RESULT),
@@ -46,7 +46,7 @@ PLAYED: Topics = {
     CAMERA_POSE_TOPIC: (PoseWithCovarianceStamped, qos.RESULT),
     IMU_TOPIC: (Imu, qos.IMU_RATE_RESULT),
 }
-_RESULTS: dict[str, Topics] = {
+_RESULTS: dict[str, TopicTypes] = {
     'tau2_camera': {},
     'aruco_detector': {MARKERS_TOPIC: (PointCloud2, qos.RESULT), 'marker_poses': (PoseArray, qos.RESULT)},
     'marker_mapper': {
@@ -61,9 +61,9 @@ _RESULTS: dict[str, Topics] = {
         'odometry': (Odometry, qos.IMU_RATE_RESULT),
     },
 }
-_DIAGNOSTICS: Topics = {'/diagnostics': (DiagnosticArray, qos.IMU_RATE_RESULT)}
-_CALIBRATION: Topics = {CAMERA_INFO_TOPIC: (CameraInfo, qos.RESULT)}
-_IMAGES: Topics = {'thermal/image': (Image, qos.IMAGE_OUTPUT)}
+_DIAGNOSTICS: TopicTypes = {'/diagnostics': (DiagnosticArray, qos.IMU_RATE_RESULT)}
+_CALIBRATION: TopicTypes = {CAMERA_INFO_TOPIC: (CameraInfo, qos.RESULT)}
+_IMAGES: TopicTypes = {'thermal/image': (Image, qos.IMAGE_OUTPUT)}
 
 
 @dataclass(frozen=True)
@@ -92,29 +92,29 @@ class Entry:
         """The nodes to run for a second camera ``name``: those before the mapper."""
         return tuple(f'{name}/{node}' for node in self.nodes if node in OF_CAMERA)
 
-    def played(self, *, calibration_from_file: bool) -> Topics:
+    def played(self, *, calibration_from_file: bool) -> TopicTypes:
         """Required topics of the bag."""
         always = {topic: PLAYED[topic] for topic in (self.topic, IMU_TOPIC)}
         return always | self._of_camera(calibration_from_file=calibration_from_file)
 
-    def played_of_second(self, name: str, *, calibration_from_file: bool) -> Topics:
+    def played_of_second(self, name: str, *, calibration_from_file: bool) -> TopicTypes:
         """Required topics of a second camera ``name``."""
         own = self._of_camera(calibration_from_file=calibration_from_file)
         return {f'{name}/{topic}': played for topic, played in own.items()}
 
-    def _of_camera(self, *, calibration_from_file: bool) -> Topics:
+    def _of_camera(self, *, calibration_from_file: bool) -> TopicTypes:
         topics = [self.topic]
         # Only the first node publishes a calibration from a file.
         if self.needs_calibration and not (calibration_from_file and self.skipped == 0):
             topics.append(CAMERA_INFO_TOPIC)
         return {topic: PLAYED[topic] for topic in topics}
 
-    def recorded_of_second(self, name: str, *, calibration_from_file: bool) -> Topics:
+    def recorded_of_second(self, name: str, *, calibration_from_file: bool) -> TopicTypes:
         """Topics of a second camera ``name`` to record: its markers, and the calibration if its node publishes it."""
         topics = {MARKERS_TOPIC: PLAYED[MARKERS_TOPIC]} | (_CALIBRATION if calibration_from_file else {})
         return {f'{name}/{topic}': recorded for topic, recorded in topics.items()}
 
-    def recorded(self, *, calibration_from_file: bool, images: bool) -> Topics:
+    def recorded(self, *, calibration_from_file: bool, images: bool) -> TopicTypes:
         """Topics to record: outputs of the nodes, or the bag's in their place; images only on request."""
         topics = {name: entry for node in self.nodes for name, entry in _RESULTS[node].items()}
         if self.skipped:

@@ -23,7 +23,7 @@ _FALLBACK_RATE = 30.0
 _NEAR_NS = 20_000_000
 _LINE_PX = 26
 
-Frame = npt.NDArray[np.uint8]
+_BgrPixels = npt.NDArray[np.uint8]
 
 
 def require_encoder() -> None:
@@ -73,9 +73,9 @@ def _rate(reader: BagReader, count: int) -> float:
     return round(count / seconds, 2) if count > 2 and seconds > 0.0 else _FALLBACK_RATE
 
 
-def _captioned(run: Run, reader: BagReader) -> Iterator[Frame]:
+def _captioned(run: Run, reader: BagReader) -> Iterator[_BgrPixels]:
     """The frames with markers and captions; a dropped frame repeats the last one, with the reason."""
-    last: Frame | None = None
+    last: _BgrPixels | None = None
     start_ns: int | None = None
     closed = [(entry.start_ns, entry.end_ns) for entry in interruptions(run, None) if entry.is_shutter]
     for view in views(reader):
@@ -109,7 +109,7 @@ def _place(run: Run, stamp_ns: int) -> str:
 
 
 @contextmanager
-def _encoded(path: Path, first: Frame, rate: float) -> Iterator[Callable[[Frame], None]]:
+def _encoded(path: Path, first: _BgrPixels, rate: float) -> Iterator[Callable[[_BgrPixels], None]]:
     """Context with a function that takes the frames of a video, all of the size of the ``first`` one."""
     from fractions import Fraction
 
@@ -121,7 +121,7 @@ def _encoded(path: Path, first: Frame, rate: float) -> Iterator[Callable[[Frame]
             stream = container.add_stream('libx264', rate=Fraction(rate).limit_denominator(1000), options={'crf': '24'})
             stream.width, stream.height, stream.pix_fmt = width, height, 'yuv420p'
 
-            def take(frame: Frame) -> None:
+            def take(frame: _BgrPixels) -> None:
                 picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format='bgr24')
                 container.mux(stream.encode(picture))
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
-from thermal_fiducial.sim.spline_trajectory import GRAVITY, Path
+from thermal_fiducial.sim.spline_trajectory import GRAVITY, MotionPath
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class ImuModel:
     instability_time: float = 2.0
     delivery: Delivery | None = None
 
-    def sample(self, trajectory: Path, times: FloatArray, stamps_ns: IntArray, seed: int) -> ImuRecord:
+    def sample(self, trajectory: MotionPath, times: FloatArray, stamps_ns: IntArray, seed: int) -> ImuRecord:
         """Measurements of the IMU at ``times`` (N,) [s] of a flight, with true stamps ``stamps_ns`` (N,).
 
         A discrete sample of white noise of density n at rate f has deviation n sqrt(f), a bias of random walk

@@ -33,7 +33,7 @@ from thermal_fiducial.sim.plate_lookup import (
     strips,
 )
 from thermal_fiducial.sim.scene import Acrylic, Fog, Plate, Room
-from thermal_fiducial.sim.spline_trajectory import Path
+from thermal_fiducial.sim.spline_trajectory import MotionPath
 
 #: Number of points of a pixel and sub-frame to generators of the lattice (column, row, time), found by exhaustive
 #: search for the largest distance between points in each projection.
@@ -83,7 +83,7 @@ class Renderer:
         room: Room,
         fog: Fog,
         acrylic: Acrylic,
-        trajectory: Path,
+        trajectory: MotionPath,
         T_body_camera: FloatArray,
         interval: float = 1 / 30,
         lag: float = 0.010,

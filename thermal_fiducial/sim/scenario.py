@@ -13,7 +13,7 @@ from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scene import Acrylic, Clutter, clutter_plate, Fog, Marker, marker_plate, Plate, Room
 from thermal_fiducial.sim.sensor import IDEAL, Sensor
-from thermal_fiducial.sim.spline_trajectory import Flight, Path, pose_matrix
+from thermal_fiducial.sim.spline_trajectory import Flight, MotionPath, pose_matrix
 from thermal_fiducial.sim.vibration import Shaken, Vibration
 from thermal_fiducial.sim.waving import Waving
 
@@ -90,7 +90,7 @@ class Scenario:
         markers = [marker_plate(marker, self.aruco_dictionary, self.acrylic) for marker in self.markers]
         return markers + [clutter_plate(item) for item in self.clutter]
 
-    def trajectory(self, seconds: float, seed: int) -> Path:
+    def trajectory(self, seconds: float, seed: int) -> MotionPath:
         """The flight, shaken by the vibration."""
         smooth = self.flight.trajectory(seconds, seed)
         return smooth if self.vibration is None else Shaken(smooth, self.vibration, seed)

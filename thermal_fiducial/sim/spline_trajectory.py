@@ -40,7 +40,7 @@ def pose_matrix(rotation: Rotation, position: npt.ArrayLike) -> FloatArray:
     return T
 
 
-class Path(Protocol):
+class MotionPath(Protocol):
     """A path of a body."""
 
     def __call__(self, t: npt.ArrayLike, /) -> Motion:

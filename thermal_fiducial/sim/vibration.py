@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.sim.spline_trajectory import Motion, Path
+from thermal_fiducial.sim.spline_trajectory import Motion, MotionPath
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Vibration:
 class Shaken:
     """A path with vibration: p + d in ``map``, and R Exp(theta)."""
 
-    path: Path
+    path: MotionPath
     vibration: Vibration
     seed: int
 

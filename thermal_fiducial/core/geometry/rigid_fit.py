@@ -33,8 +33,8 @@ _MINUS_SKEW = -se3.SKEW
 #: Chi square of a point, or of a view, behind the camera: of a gross outlier.
 BEHIND_CHI2 = 1e8
 
-#: At poses (B, 4, 4): cost (B,), gradient (B, 6), information (B, 6, 6).
-Evaluation = tuple[FloatArray, FloatArray, FloatArray]
+#: The cost about poses (B, 4, 4): its value there (B,), gradient (B, 6), information (B, 6, 6).
+Quadratic = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +62,8 @@ class Images:
 
 
 def minimise(
-    T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alternatives: int = 1, linear: float = TINY
-) -> Evaluation:
+    T: FloatArray, evaluated: Callable[[FloatArray], Quadratic], alternatives: int = 1, linear: float = TINY
+) -> Quadratic:
     """Poses with the least costs, from starts ``T`` (B, 4, 4).
 
     Parameters
@@ -123,7 +123,7 @@ def costs(T: FloatArray, points: FloatArray, images: Images, inlier: float) -> F
     return np.asarray(np.where(z > TINY, squared, behind).sum(axis=-1))
 
 
-def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> Evaluation:
+def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> Quadratic:
     """Robust squared error at poses (B, 4, 4) of bodies in the camera, inf where a point is behind it, and derivatives.
 
     ``points`` are (B or 1, K, 3) [m] in their bodies. Of a whitened error d, the cost is d^2 up to ``inlier`` and

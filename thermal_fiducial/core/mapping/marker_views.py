@@ -18,7 +18,7 @@ from thermal_fiducial.core.error_model import (
 )
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import linearise
-from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
+from thermal_fiducial.core.geometry.rigid_fit import minimise, Quadratic
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -235,7 +235,7 @@ class MarkerViews:
         """Poses (S, 4, 4) from starts, and their chi squares (S,), inf where there is none."""
         T_map_camera = self._T_map_camera[np.arange(chosen.shape[1]), chosen]
 
-        def evaluated(T: FloatArray) -> Evaluation:
+        def evaluated(T: FloatArray) -> Quadratic:
             r, _, J = self._linearised(T, T_map_camera)
             r, J = (begun.W @ r[..., None]).reshape(len(T), -1, 1), (begun.W @ J).reshape(len(T), -1, 6)
             J_transposed, chi2 = np.swapaxes(J, -1, -2), np.sum(r * r, axis=(1, 2))

@@ -14,7 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 
-from thermal_fiducial.config import without_effect
+from thermal_fiducial.config import Config, without_effect
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.reading import one_line
 from thermal_fiducial.ros.base import params
@@ -24,7 +24,6 @@ from thermal_fiducial.ros.base.hearing import replaced_ports
 from thermal_fiducial.ros.base.input_rates import InputRates
 from thermal_fiducial.ros.messages import convert
 
-Config = TypeVar('Config')
 Made = TypeVar('Made')
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR

@@ -2,17 +2,15 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import Field
-from typing import Any, get_args, TypeVar
+from typing import Any, get_args
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from thermal_fiducial.config import check_names, from_mapping, parameters, QOS_OVERRIDES
+from thermal_fiducial.config import check_names, Config, from_mapping, parameters, QOS_OVERRIDES
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
-
-Config = TypeVar('Config')
 
 _ARRAYS = {
     float: Parameter.Type.DOUBLE_ARRAY,

@@ -17,13 +17,13 @@ from thermal_fiducial.ros.camera_nodes.latest_calibration import LatestCalibrati
 from thermal_fiducial.ros.frames.robot_frames import RobotFrames
 from thermal_fiducial.ros.messages import message_bytes
 
-Config = TypeVar('Config', bound=ArucoDetectorConfig | MarkerMapperConfig)
+CameraConfig = TypeVar('CameraConfig', bound=ArucoDetectorConfig | MarkerMapperConfig)
 
 
-class CameraStageNode(StageNode[Config]):
+class CameraStageNode(StageNode[CameraConfig]):
     """A stage node that subscribes to ``thermal/camera_info`` (keeping the last valid one) and ``odometry``."""
 
-    def __init__(self, name: str, kind: type[Config], **kwargs: Any) -> None:
+    def __init__(self, name: str, kind: type[CameraConfig], **kwargs: Any) -> None:
         super().__init__(name, kind, **kwargs)
         self._calibration = LatestCalibration(self)
         #: the filter's latest states

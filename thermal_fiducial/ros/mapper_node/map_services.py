@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -18,11 +18,10 @@ from thermal_fiducial.files.dictionary import other_patterns
 from thermal_fiducial.files.map_keeper import MapKeeper
 from thermal_fiducial.files.marker_map import other_frame
 from thermal_fiducial.files.reading import is_there
-from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.base.node import Made, StageNode
 from thermal_fiducial.ros.mapper_node.map_refinement import MapRefinement
 
 Answer = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
-Made = TypeVar('Made')
 
 #: Time for which a service waits for a disk [s]; no frame is processed meanwhile.
 _PATIENCE_S = 1.0

@@ -101,7 +101,7 @@ class _Topic:
 
 
 @dataclass
-class _Node:
+class _NodeStatus:
     time: float
     level: int
     message: str
@@ -121,7 +121,7 @@ class LiveStatus:
         self._odometry, self._camera_pose, self._frames = _Topic(), _Topic(), _Topic()
         self._markers: tuple[int, ...] = ()
         self._sigma: tuple[float, float] | None = None
-        self._nodes: dict[str, _Node] = {}
+        self._nodes: dict[str, _NodeStatus] = {}
         #: namespaces, but for the root, in which a filter runs
         self._elsewhere: set[str] = set()
         self._refusals: deque[tuple[float, str]] = deque(maxlen=MOST_REFUSALS)
@@ -150,7 +150,7 @@ class LiveStatus:
         if node not in STAGES:
             return
         before = self._nodes.get(node)
-        self._nodes[node] = _Node(now, level, message, figures)
+        self._nodes[node] = _NodeStatus(now, level, message, figures)
         refusal = figures.get(LAST_REFUSED)
         # The filter repeats it until a pose is accepted, also while no pose comes.
         if refusal and (
