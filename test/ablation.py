@@ -144,7 +144,7 @@ def _nothing_found(*_: Any) -> Any:
 
 
 def _by_optics_alone(corners_px: Any, cells: int, blur_px: float, *_: Any, **__: Any) -> Any:
-    return _place('corners.pattern_fit:too_small_for_sides')(corners_px, cells, blur_px)
+    return _place('corners.side_fit:too_small_for_sides')(corners_px, cells, blur_px)
 
 
 def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:

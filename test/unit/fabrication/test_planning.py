@@ -5,7 +5,7 @@ import yaml
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.cli.marker_measurement import camera_and_detector, show
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corners.pattern_fit import too_small_for_sides
+from thermal_fiducial.core.detection.corners.side_fit import too_small_for_sides
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.planning import (

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corners.corner_errors import BLURRED_OUT, OF_LOCAL_PX
-from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
+from thermal_fiducial.core.detection.corners.corner_errors import BLURRED_OUT, OF_LOCAL_PX, RefinedCorners
 from thermal_fiducial.core.detection.corners.refining import RefinedMarkers
 from thermal_fiducial.core.detection.finding.quads import halfway, halved
 from thermal_fiducial.core.detection.patterns import Decoder, Reading

@@ -11,13 +11,13 @@ from thermal_fiducial.core.detection.corners.refining import refine
 from thermal_fiducial.core.detection.finding.finder import FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.partial.partial_markers import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, Dictionary
-from thermal_fiducial.core.detection.plates import corners_of_faces
 from thermal_fiducial.core.detection.prediction.frame import Frame
 from thermal_fiducial.core.detection.prediction.known_markers import among, depths, ExpectedMarkers, KnownMarkers
 from thermal_fiducial.core.detection.prediction.tracking import MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses, solve_marker_poses
+from thermal_fiducial.core.geometry.reprojection import corners_of_faces
 from thermal_fiducial.core.measurements import marker_rows, Markers
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray

@@ -1,4 +1,4 @@
-"""Markers as a camera sees them: re-projected corners, with derivatives, and quadrilaterals in an image.
+"""Markers as a camera sees them: re-projected corners, with derivatives, quadrilaterals in an image, thick plates.
 
 Poses are perturbed in the ROS convention of :mod:`thermal_fiducial.core.measurements`: ``d`` is (x y z, rotation
 about x y z), both in the map frame. With ``p_camera = R' (R_m c + t_m - t)`` for a corner ``c`` of the marker,
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from thermal_fiducial.core.geometry.se3 import (
     apply,
+    inverse,
     skew,
     so3_exp,
     so3_left_jacobian,
@@ -22,7 +23,7 @@ from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
 
 if TYPE_CHECKING:
     # Not imported here: the filter uses this module, and restarts sooner without OpenCV.
-    from thermal_fiducial.core.geometry.camera import Camera
+    from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 
 #: Numbers in either precision.
 Real = TypeVar('Real', FloatArray, Float32Array)
@@ -218,3 +219,45 @@ def perspective(c: FloatArray) -> FloatArray:
     triangle = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     triangle[np.abs(triangle) < TINY] = TINY
     return np.asarray(triangle)
+
+
+def corners_of_faces(
+    at: 'ImagePoints', T_camera_marker: FloatArray, sizes: FloatArray, thickness: float
+) -> 'ImagePoints':
+    """Corners of the faces of N markers in plates of some thickness.
+
+    From the side, outlines are larger than faces, and those of holes smaller: the cut sides of a plate are as cold as
+    its face, and where the camera sees one, the outline ends at the back edge instead of the front edge. Seen through
+    the camera's centre, back edges lie on the plane of the face, parallel to the front edges: the outline of a square
+    is a rectangle there.
+
+    Parameters
+    ----------
+    at : (N, 4) corners of the outlines
+    T_camera_marker : (N, 4, 4) poses by these outlines; those that are not finite change nothing
+    sizes : (N,) sides of the faces [m]
+    thickness : of all plates [m]
+    """
+    faces = marker_corners(sizes)
+    outlines = outlines_on_faces(faces, np.sign(faces[..., :2]), inverse(T_camera_marker)[:, :3, 3], thickness)
+    face, outline = (apply(T_camera_marker, points) for points in (faces, outlines))
+    wider = outline[..., :2] / outline[..., 2:] - face[..., :2] / face[..., 2:]
+    beyond_px = (at.J @ wider[..., None])[..., 0]
+    return at.at_pixels(at.px - np.where(np.isfinite(beyond_px), beyond_px, 0.0))
+
+
+def outlines_on_faces(edges: FloatArray, outward: FloatArray, camera: FloatArray, thickness: float) -> FloatArray:
+    """Points (N, P, 3) on the outlines of what plates hide, on the planes of their faces, in their own frames.
+
+    Parameters
+    ----------
+    edges : (N, P, 3) points on the edges of the faces, or corners of them [m]
+    outward : (N, P or 1, 2) direction out of the plate along each axis, -1 or 1, 0 along an edge
+    camera : (N or 1, 3) positions of the camera, in front of the faces
+    """
+    # The ray to a back edge at depth t crosses the plane of the face by the share t / (t + h) nearer to the camera.
+    share = thickness / (thickness + camera[:, None, 2:])
+    seen_from_side = np.maximum(outward * (camera[:, None, :2] - edges[..., :2]), 0.0)
+    outlines = edges.copy()
+    outlines[..., :2] += outward * share * seen_from_side
+    return outlines

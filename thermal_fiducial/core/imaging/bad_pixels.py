@@ -8,7 +8,7 @@ pixel has several neighbours of similar value.
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.pixel_noise import pixel_noise
+from thermal_fiducial.core.camera_frames import pixel_noise
 from thermal_fiducial.core.types import BoolArray, Counts, IntArray
 from thermal_fiducial.errors import InputError
 

@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.frame_period import FramePeriod
+from thermal_fiducial.core.camera_frames import FramePeriod, pixel_noise
 from thermal_fiducial.core.geometry.plausibility import require_image
 from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder
 from thermal_fiducial.core.measurements import LATEST_NS
-from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.core.types import Counts, Gray, IntArray
 from thermal_fiducial.errors import InputError
 

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.config import CHI2_OF_POSE
+from thermal_fiducial.core.camera_frames import FramePeriod
 from thermal_fiducial.core.error_model import covariance_of_correlated_poses, covariance_of_one_error
-from thermal_fiducial.core.frame_period import FramePeriod
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.located import squared_distance

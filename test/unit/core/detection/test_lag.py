@@ -12,7 +12,8 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.blurred_patterns import PatternView
 from thermal_fiducial.core.detection.corners.corner_errors import OF_LAG_FORM, of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.corners.gray_scale import UNKNOWN_SCALE
-from thermal_fiducial.core.detection.corners.pattern_fit import fit_patterns, nearness, too_blurred_for_sides
+from thermal_fiducial.core.detection.corners.pattern_fit import fit_patterns, nearness
+from thermal_fiducial.core.detection.corners.side_fit import too_blurred_for_sides
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.prediction.frame import (
     counts_of,

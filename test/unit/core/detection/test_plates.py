@@ -6,9 +6,8 @@ import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.plates import outlines_on_faces
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import marker_corners
+from thermal_fiducial.core.geometry.reprojection import marker_corners, outlines_on_faces
 from thermal_fiducial.core.geometry.se3 import apply, so3_exp, transform
 from thermal_fiducial.core.measurements import corners_px
 from thermal_fiducial.files.dictionary import load_dictionary

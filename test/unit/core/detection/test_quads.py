@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from thermal_fiducial.core.camera_frames import with_columns_corrected
 from thermal_fiducial.core.detection.finding.quads import (
     dark_in_picture,
     DarkRegions,
@@ -12,7 +13,6 @@ from thermal_fiducial.core.detection.finding.quads import (
     halved,
     Scale,
 )
-from thermal_fiducial.core.pixel_noise import with_columns_corrected
 
 SHAPE = 240, 320
 FINE = Scale(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5, most=60.0)

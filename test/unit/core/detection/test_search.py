@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.camera_frames import pixel_noise
 from thermal_fiducial.core.detection.finding.search import BlindSearch, inside_out, SearchScales
 from thermal_fiducial.core.detection.patterns import Decoder, Reading, sampled, shrunk
 from thermal_fiducial.core.detection.prediction.frame import Frame, Places
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = load_dictionary('DICT_4X4_50').bits

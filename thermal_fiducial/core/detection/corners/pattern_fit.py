@@ -33,13 +33,14 @@ from thermal_fiducial.core.detection.corners.corner_errors import (
     LEVEL_BENDS,
     OF_DISPLAYED_PATTERN_PX,
     OF_PATTERN_PX,
+    RefinedCorners,
     SURFACE_FALLS,
 )
 from thermal_fiducial.core.detection.corners.pattern_residuals import linearised, PatternResiduals
-from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
+from thermal_fiducial.core.detection.corners.side_fit import too_small_for_sides
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.prediction.frame import Frame, MotionBlur
+from thermal_fiducial.core.detection.prediction.frame import Frame
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.reprojection import diagonals, sides_px, squared_sides, widths
@@ -47,12 +48,6 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 
 # Bound on the number of false markers in a picture, were all of it squares with a black border around random bits.
 _FALSE_MARKERS = 0.01
-# Width of cells, in blurs of the optics, below which whole patterns are fitted: at 7 a frame of 45 markers would take
-# twice the time.
-_NARROW = 6.0
-# The same in blurs of optics and motion together: at 6 a fast frame takes a third longer, and a wrong time constant of
-# the bolometers displaces corners more.
-_NARROW_IN_MOTION = 4.5
 # Distance of samples [px]: 0.85 px gives no better corners; least and largest number of them along a cell. Where cells
 # are wider, they are near the lines between cells, at about this distance [blurs].
 _APART_PX, _FEWEST, _MOST = 1.0, 3, 6
@@ -142,20 +137,6 @@ class PatternFit(NamedTuple):
     step_px: FloatArray
     #: at the corners
     residuals: PatternResiduals
-
-
-def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> BoolArray:
-    """Which markers (N, 4, 2) have sides that are not measured by themselves, for a blur of the optics [px].
-
-    Of a marker that is turned away the cells are narrow along one direction only, and that is what counts.
-    """
-    return np.asarray(widths(corners_px) < _NARROW * blur_px * cells)
-
-
-def too_blurred_for_sides(corners_px: FloatArray, cells: int, blur_px: float, motion: MotionBlur) -> BoolArray:
-    """Which markers (N, 4, 2) have sides that are not measured by themselves, for their size or for motion blur."""
-    blurs_px = np.hypot(blur_px, np.hypot(*motion.spread.T))
-    return np.asarray(widths(corners_px) < np.maximum(_NARROW * blur_px, _NARROW_IN_MOTION * blurs_px) * cells)
 
 
 def nearness(corners_px: FloatArray, cells: int, blurs_px: FloatArray) -> IntArray:

@@ -19,11 +19,16 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.blurred_patterns import lens_bends, PatternView
-from thermal_fiducial.core.detection.corners.corner_errors import of_motion_blur, unknown_motion
+from thermal_fiducial.core.detection.corners.corner_errors import of_motion_blur, RefinedCorners, unknown_motion
 from thermal_fiducial.core.detection.corners.gray_scale import GrayScale
-from thermal_fiducial.core.detection.corners.pattern_fit import fitted_patterns, nearness, too_blurred_for_sides
-from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
-from thermal_fiducial.core.detection.corners.side_fit import OF_CLEAR, OF_FAINT, PASSES, refine_corners
+from thermal_fiducial.core.detection.corners.pattern_fit import fitted_patterns, nearness
+from thermal_fiducial.core.detection.corners.side_fit import (
+    OF_CLEAR,
+    OF_FAINT,
+    PASSES,
+    refine_corners,
+    too_blurred_for_sides,
+)
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.prediction.frame import (
     delays,

@@ -1,4 +1,4 @@
-"""Fit of whole markers' sides, and the corners in which they meet.
+"""Fit of whole markers' sides, where these can be measured by themselves, and the corners in which they meet.
 
 Columns of whole pixels across the sides are fitted with the model of a blurred edge, segment by segment, on raw counts.
 A robust adjustment of the four corners to all segments follows; both are repeated until the corners converge.
@@ -8,9 +8,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corners.corner_errors import OF_ALL_SIDES_PX, OF_LAG_FORM
-from thermal_fiducial.core.detection.corners.reach import ending_sides, Reach
-from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
+from thermal_fiducial.core.detection.corners.corner_errors import OF_ALL_SIDES_PX, OF_LAG_FORM, RefinedCorners
 from thermal_fiducial.core.detection.corners.segments import (
     adjust,
     measure,
@@ -29,9 +27,10 @@ from thermal_fiducial.core.detection.corners.sides import (
     sides_of,
 )
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
-from thermal_fiducial.core.detection.corners.uneven_contrast import freed_of_unevenness
+from thermal_fiducial.core.detection.corners.warm_surface import ending_sides, freed_of_unevenness, Reach
 from thermal_fiducial.core.detection.prediction.frame import counts_of, MotionBlur
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.reprojection import widths
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
 #: Columns of pixels per cell for clear markers, and for faint ones.
@@ -44,6 +43,26 @@ PASSES = 4
 # A corner has converged when its last step is below _UNSURE of its standard deviations, clipped to the limits
 # _SETTLED_PX [px].
 _SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
+# Width of cells, in blurs of the optics, below which whole patterns are fitted: at 7 a frame of 45 markers would take
+# twice the time.
+_NARROW = 6.0
+# The same in blurs of optics and motion together: at 6 a fast frame takes a third longer, and a wrong time constant of
+# the bolometers displaces corners more.
+_NARROW_IN_MOTION = 4.5
+
+
+def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> BoolArray:
+    """Which markers (N, 4, 2) have sides that are not measured by themselves, for a blur of the optics [px].
+
+    Of a marker that is turned away the cells are narrow along one direction only, and that is what counts.
+    """
+    return np.asarray(widths(corners_px) < _NARROW * blur_px * cells)
+
+
+def too_blurred_for_sides(corners_px: FloatArray, cells: int, blur_px: float, motion: MotionBlur) -> BoolArray:
+    """Which markers (N, 4, 2) have sides that are not measured by themselves, for their size or for motion blur."""
+    blurs_px = np.hypot(blur_px, np.hypot(*motion.spread.T))
+    return np.asarray(widths(corners_px) < np.maximum(_NARROW * blur_px, _NARROW_IN_MOTION * blurs_px) * cells)
 
 
 def refine_corners(

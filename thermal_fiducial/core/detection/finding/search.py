@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.camera_frames import with_columns_corrected
 from thermal_fiducial.core.detection.corners.pattern_fit import aligned
 from thermal_fiducial.core.detection.finding.quads import (
     dark_in_picture,
@@ -19,7 +20,6 @@ from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
 from thermal_fiducial.core.detection.prediction.frame import Frame
 from thermal_fiducial.core.detection.prediction.known_markers import among, CUT_OFF_PX, FoundMarkers, TOGETHER
 from thermal_fiducial.core.geometry.reprojection import diagonals, grown, sides_px, squared_sides
-from thermal_fiducial.core.pixel_noise import with_columns_corrected
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.

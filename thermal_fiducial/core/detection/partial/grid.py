@@ -29,7 +29,6 @@ from thermal_fiducial.core.detection.corners.sides import (
     NODES,
     Sides,
 )
-from thermal_fiducial.core.detection.plates import outlines_on_faces
 from thermal_fiducial.core.detection.prediction.frame import (
     counts_of,
     Frame,
@@ -43,7 +42,7 @@ from thermal_fiducial.core.detection.prediction.frame import (
 )
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.reprojection import retract
+from thermal_fiducial.core.geometry.reprojection import outlines_on_faces, retract
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
 
 # Columns of pixels across an edge.

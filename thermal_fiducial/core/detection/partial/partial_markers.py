@@ -10,9 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corners.corner_errors import OF_BENT_SCALE_PX, of_motion_blur, OF_SIDES_PX
+from thermal_fiducial.core.detection.corners.corner_errors import (
+    OF_BENT_SCALE_PX,
+    of_motion_blur,
+    OF_SIDES_PX,
+    RefinedCorners,
+)
 from thermal_fiducial.core.detection.corners.gray_scale import GrayScale
-from thermal_fiducial.core.detection.corners.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.partial.grid import (
     adjusted,
     grid_edges,

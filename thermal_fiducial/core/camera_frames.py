@@ -1,5 +1,6 @@
-"""Noise of the pixels of a frame, and the fixed pattern of its columns, from the frame itself."""
+"""What the frames of a camera show of it: the period by their stamps; by their counts, noise and pattern of columns."""
 
+from collections import deque
 import math
 
 import cv2
@@ -44,3 +45,34 @@ def with_columns_corrected(counts: Float32Array, noise: float) -> Float32Array:
     np.cumsum(_CLIPPED / len(counts) * offsets, axis=1, out=offsets)
     offsets -= cv2.blur(offsets, (_COLUMNS, 1))
     return np.subtract(counts, offsets, out=counts)
+
+
+class FramePeriod:
+    """Period of a camera's frames, for all that waits for a frame or counts lost ones.
+
+    It is the median of the latest intervals between frames, so that lost frames and pauses do not change it.
+
+    Of an even number it is the lower one: a pause makes intervals longer, nothing makes them shorter.
+    """
+
+    #: Of a Tau 2 at full rate: until a second frame has come.
+    ASSUMED_NS = 33_333_333
+    INTERVALS = 9
+
+    def __init__(self) -> None:
+        #: newest stamp; None before the first frame
+        self.newest_ns: int | None = None
+        self._intervals_ns: deque[int] = deque(maxlen=self.INTERVALS)
+
+    def add(self, stamp_ns: int) -> None:
+        """Log a frame; a late one is no measure of the period."""
+        if self.newest_ns is not None and stamp_ns > self.newest_ns:
+            self._intervals_ns.append(stamp_ns - self.newest_ns)
+        self.newest_ns = stamp_ns if self.newest_ns is None else max(stamp_ns, self.newest_ns)
+
+    @property
+    def ns(self) -> int:
+        """The period [ns]."""
+        if not self._intervals_ns:
+            return self.ASSUMED_NS
+        return sorted(self._intervals_ns)[(len(self._intervals_ns) - 1) // 2]
