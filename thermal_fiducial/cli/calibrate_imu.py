@@ -10,10 +10,10 @@ from thermal_fiducial.calibration.sources import imu_track, imu_track_of_csv
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
+from thermal_fiducial.report.metrics import rms
 
 if TYPE_CHECKING:
     from thermal_fiducial.calibration.allan_deviation import AllanFit, ImuNoiseFit
@@ -84,19 +84,15 @@ def noise_text(fit: 'ImuNoiseFit') -> str:
         ('gyroscope_random_walk', fit.gyroscope.walk, usual.gyroscope_random_walk),
         ('accelerometer_random_walk', fit.accelerometer.walk, usual.accelerometer_random_walk),
     ):
-        axes, found = ', '.join(f'{value:.2e}' for value in values), _rms(values)
+        axes, found = ', '.join(f'{value:.2e}' for value in values), rms(values)
         remark = '' if found >= least else f'in flight; at rest {found:.1e} '
         lines.append(f'      {name}: {max(found, least):.4e}  # {remark}({axes})')
     for name, sensor in (('gyroscope', fit.gyroscope), ('accelerometer', fit.accelerometer)):
-        lines.append(f'# bias instability of the {name}: {_rms(sensor.instability):.2e}')
+        lines.append(f'# bias instability of the {name}: {rms(sensor.instability):.2e}')
     return '\n'.join(lines) + '\n'
 
 
 def _deviations(name: str, sensor: 'AllanFit', unit: str) -> str:
     nearest = [int(np.argmin(np.abs(np.log(sensor.tau / tau)))) for tau in _SHOWN if tau <= 1.5 * sensor.tau[-1]]
-    parts = [f'{sensor.tau[k]:.3g} s: {_rms(sensor.deviation[k]):.2e}' for k in nearest]
+    parts = [f'{sensor.tau[k]:.3g} s: {rms(sensor.deviation[k]):.2e}' for k in nearest]
     return f'{name}, Allan deviation [{unit}]: ' + ', '.join(parts)
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -16,6 +16,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.point_cloud import load_cloud, save_alignment, thinned
 from thermal_fiducial.map_tools.cloud_alignment import align_to_cloud, CloudAlignment
+from thermal_fiducial.report.metrics import rms
 
 # Largest number of points in the picture; more would not be visible.
 _DRAWN = 200_000
@@ -68,8 +69,7 @@ def _print_result(alignment: CloudAlignment) -> None:
         table.add_row(str(fit.id), f'{1e3 * fit.distance_m:.1f}', f'{np.rad2deg(fit.angle):.2f}', str(fit.points))
     show(table)
     distances = np.array([fit.distance_m for fit in alignment.fits])
-    rms_mm = 1e3 * np.sqrt(np.mean(distances**2))
-    print(f'{number_of(len(distances), "marker")}, {rms_mm:.1f} mm rms from their surfaces')
+    print(f'{number_of(len(distances), "marker")}, {1e3 * rms(distances):.1f} mm rms from their surfaces')
     if alignment.without_surface:
         print(f'no surface near markers {", ".join(map(str, alignment.without_surface))}')
     if alignment.open_directions:

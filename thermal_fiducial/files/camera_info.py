@@ -4,14 +4,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import require_usable
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.plain_yaml import save_plain
 from thermal_fiducial.files.schema import load_yaml, Value
-from thermal_fiducial.files.writing import write_text
 
 _LARGEST_SIDE = 65_535
 #: Other tools' names of the distortion models.
@@ -87,7 +86,7 @@ def save_camera(path: str | Path, camera: Camera, name: str = 'tau2') -> None:
         'rectification_matrix': _entry(np.eye(3)),
         'projection_matrix': _entry(projection),
     }
-    write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
+    save_plain(path, content)
 
 
 def _entry(matrix: FloatArray) -> dict[str, Any]:

@@ -4,14 +4,13 @@ from pathlib import Path
 import re
 
 import numpy as np
-import yaml
 
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.plain_yaml import save_plain
 from thermal_fiducial.files.schema import load_yaml
-from thermal_fiducial.files.writing import write_text
 
 # Sizes in a PLY or PCD header: elements, points, width and height.
 _COUNTS = re.compile(rb'^(?:element +\S+|POINTS|WIDTH|HEIGHT) +([0-9]{1,18})[0-9]*\s*$', re.MULTILINE)
@@ -81,7 +80,7 @@ def save_alignment(path: Path, T_cloud_map: FloatArray, cloud: str, frame_id: st
         'position': [round(float(v), 9) for v in T_cloud_map[:3, 3]],
         'orientation': [round(float(v), 9) for v in quaternion_from_rotation(T_cloud_map[:3, :3])],
     }
-    write_text(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
+    save_plain(path, document)
 
 
 def load_alignment(path: str | Path) -> FloatArray:

@@ -17,6 +17,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.frames import annotated, view_at
+from thermal_fiducial.report.metrics import rms
 
 #: Number of colours of the PNG; few keep it small for a README.
 COLOURS = 160
@@ -112,8 +113,7 @@ def draw_error(axis: Axes, evaluation: Evaluation) -> None:
     axis.set(title='Error against ground truth', xlabel='time [s]', ylabel='position error [mm]')
     largest = 0.0
     for name, colour, t, error in _errors(evaluation):
-        rms = float(np.sqrt(np.mean(error**2)))
-        axis.plot(t, error, '.', color=colour, markersize=1.5, label=f'{name}: {rms:.1f} mm rms')
+        axis.plot(t, error, '.', color=colour, markersize=1.5, label=f'{name}: {rms(error):.1f} mm rms')
         largest = max(largest, float(np.nanmax(error)))
     if axis.get_legend_handles_labels()[0]:
         axis.set_yscale('log')
