@@ -74,20 +74,9 @@ def confirmed(
     decoder: Decoder,
     config: ArucoDetectorConfig,
 ) -> RefinedMarkers:
-    """The markers ``found`` that are confirmed at their refined corners, with the corners to publish."""
+    """The markers ``found`` that show their pattern at the refined corners and are squares, with corners to publish."""
     if len(found.ids) == 0:
         return markers
-    keep = _are_confirmed(frame, found, markers, decoder, config)
-    markers = markers if keep.all() else markers.only(keep)
-    if config.refinement == 'subpix':
-        return replace(markers, corners=local_corners(frame.image, markers.corners, decoder.cells))
-    return markers
-
-
-def _are_confirmed(
-    frame: Frame, found: FoundMarkers, markers: RefinedMarkers, decoder: Decoder, config: ArucoDetectorConfig
-) -> BoolArray:
-    """Which markers show their pattern at the refined corners, and are squares."""
     corners = markers.observed.corners_px
     there = found.places.at.px + markers.blur.shift
     off_cells = np.abs(corners - there).max(axis=(1, 2)) * decoder.cells / sides_px(there)
@@ -102,7 +91,10 @@ def _are_confirmed(
         own = np.minimum(frame.noise / markers.observed.noise[doubtful], 1.0) ** 2
         variance = own * markers.observed.mean_variance[doubtful]
         keep[doubtful] = _square(ImagePoints.at(corners[doubtful], frame.camera), variance, decoder.cells)
-    return np.asarray(keep)
+    markers = markers if keep.all() else markers.only(keep)
+    if config.refinement == 'subpix':
+        return replace(markers, corners=local_corners(frame.image, markers.corners, decoder.cells))
+    return markers
 
 
 def _square(at: ImagePoints, variance: FloatArray, cells: int) -> BoolArray:

@@ -65,16 +65,14 @@ class FrameHistory:
     ) -> 'FrameHistory':
         """The history that the frame after one with these starts from."""
         track = self.track.after(stamp_ns, twist, markers)
-        balance = self._balance_after(stamp_ns, float(np.sign(markers.cnr).sum()))
-        return FrameHistory(track, balance, saw_partial, self.searched_ns, self.scales, gray_scale)
-
-    def _balance_after(self, stamp_ns: int, surplus: float) -> float:
-        """The balance after a frame with a ``surplus`` of dark over bright markers."""
+        # Of dark over bright markers.
+        surplus, before_ns = float(np.sign(markers.cnr).sum()), self.track.stamp_ns
         if surplus != 0.0:
-            return min(max(self.balance * (1.0 - 1.0 / _FRAMES) + surplus, -_FRAMES), _FRAMES)
-        before_ns = self.track.stamp_ns
-        elapsed_ns = 0 if before_ns is None else max(stamp_ns - before_ns, 0)
-        return self.balance * math.exp(-elapsed_ns / (_REMEMBERED_S * SECOND_NS))
+            balance = min(max(self.balance * (1.0 - 1.0 / _FRAMES) + surplus, -_FRAMES), _FRAMES)
+        else:
+            elapsed_ns = 0 if before_ns is None else max(stamp_ns - before_ns, 0)
+            balance = self.balance * math.exp(-elapsed_ns / (_REMEMBERED_S * SECOND_NS))
+        return FrameHistory(track, balance, saw_partial, self.searched_ns, self.scales, gray_scale)
 
     def searched_within(self, stamp_ns: int, seconds: float) -> bool:
         """Whether the last blind search was less than ``seconds`` before a frame; not so if stamps went back."""
