@@ -530,9 +530,6 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
         maximum=60.0,
         dynamic=True,
     )
-    max_odometry_age: float = param(
-        0.1, 'Largest age of the odometry for a guided search.', unit='s', minimum=0.0, maximum=1.0, dynamic=True
-    )
     guided_min_contrast: float = param(
         0.35,
         'min_contrast of an expected marker.',

@@ -84,7 +84,7 @@ class MarkerDetector:
         """
         camera.require_size_of(counts)
         config, known, history = self.config, self._known, self._history
-        prediction = predict_frame(stamp_ns, prior, history.track, config.max_odometry_age, config.time_offset_std)
+        prediction = predict_frame(stamp_ns, prior, history.track, config.time_offset_std)
         T_camera_map = prediction.T_camera_map
         # By which known markers are looked for.
         guide = T_camera_map if config.guided and len(known.ids) else None

@@ -30,7 +30,7 @@ def states(offset_s=0.0):
 
 
 def predicted(prior, time_offset_std=0.03):
-    return predict_frame(STAMP_NS, prior, MotionTrack(np.eye(4), 0.010), 0.2, time_offset_std)
+    return predict_frame(STAMP_NS, prior, MotionTrack(np.eye(4), 0.010), time_offset_std)
 
 
 @pytest.mark.parametrize('offset_s', [0.0, -0.060, 0.035])
@@ -38,6 +38,13 @@ def test_odometry_is_read_at_the_frame_s_stamp_in_its_own_clock(offset_s):
     found = predicted(motion_prior(*states(offset_s), clock_offset=offset_s))
     np.testing.assert_allclose(found.T_camera_map, np.eye(4), atol=1e-3)
     np.testing.assert_allclose(found.twist.value[:3], VELOCITY, atol=0.02)
+
+
+@pytest.mark.parametrize(('age_s', 'holds'), [(0.140, True), (0.160, False)])
+def test_odometry_that_is_late_gives_both_twist_and_pose_or_neither(age_s, holds):
+    """The newest state is so old."""
+    found = predicted(motion_prior(*states(-0.010 - age_s), clock_offset=0.0))
+    assert (found.twist is not None) == (found.T_camera_map is not None) == holds
 
 
 def test_slow_odometry_shows_an_acceleration():

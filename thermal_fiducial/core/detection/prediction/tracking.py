@@ -24,7 +24,7 @@ from thermal_fiducial.core.geometry.reprojection import twist_transfer
 from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS, Stacked
 
-# Longest time between frames whose motion is related [ns].
+# Longest time between frames, or from odometry to a frame, over which motion is known well enough to predict by [ns].
 _STALE_NS = 150_000_000
 # Jitter of the camera's stamps [s].
 _JITTER_S = 0.001
@@ -179,13 +179,12 @@ class FramePrediction:
 
 
 def predict_frame(
-    stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, max_age_s: float, time_offset_std: float
+    stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, time_offset_std: float
 ) -> FramePrediction:
     """Prediction of a frame at ``stamp_ns``, in the camera's clock, from odometry and the last frames' markers.
 
     Parameters
     ----------
-    max_age_s : age beyond which odometry gives no pose
     time_offset_std : standard deviation of the clock offset before the filter has estimated it [s]
     """
     if prior is None:
@@ -198,14 +197,10 @@ def predict_frame(
         states = prior.between(odometry_ns - _LONGEST_NS, odometry_ns + lag_ns, _STATES)
     if not states and (other := prior.nearest(odometry_ns)) is not None:
         states = [other]
-    if states and abs(odometry_ns - states[-1].stamp_ns) < _STALE_NS:
-        from_body = twist_transfer(track.T_body_camera)
-        twist: Twist | None = twist_by_odometry(odometry_ns, states, from_body, track.lag, clock_std_s)
-    else:
-        twist = track.predict(stamp_ns)
-    nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
-    dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) / SECOND_NS
-    if nearest is None or twist is None or abs(dt) > max_age_s:
-        return FramePrediction(twist, None, math.inf)
+    if not states or abs(odometry_ns - states[-1].stamp_ns) >= _STALE_NS:
+        return FramePrediction(track.predict(stamp_ns), None, math.inf)
+    twist = twist_by_odometry(odometry_ns, states, twist_transfer(track.T_body_camera), track.lag, clock_std_s)
+    nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns))
+    dt = (odometry_ns - nearest.stamp_ns) / SECOND_NS
     pose = extrapolated(nearest, dt, stamp_ns, track.T_body_camera, clock_std_s).pose
     return FramePrediction(twist, se3.inverse(pose.T_map_camera), math.sqrt(np.trace(pose.covariance[:3, :3])))
