@@ -219,7 +219,7 @@ def test_the_bias_of_the_corners_is_learned_from_correlated_residuals(true_px, f
         m.process(stamp(k * 30 // rate_hz), rows, CAMERA)
     # A flight sees a few independent pieces of one field: over eight fields of 0.2 px the estimate scatters by
     # 0.046 px, at 30, 10, 5, 2 and 0.7 Hz alike. Two sigma.
-    assert abs(m.corner_bias_px - true_px) < max(0.035, 0.46 * true_px)
+    assert abs(m.errors.corner_px - true_px) < max(0.035, 0.46 * true_px)
 
 
 def test_a_partially_visible_marker_does_not_change_the_bias():
@@ -237,7 +237,7 @@ def test_a_partially_visible_marker_does_not_change_the_bias():
             rows[f'c{corner}uu'][hardly] = rows[f'c{corner}vv'][hardly] = 40.0**2
         m.process(stamp(k), rows, CAMERA)
     # It falls from 0.1 px at the start to 0.07 px without that marker; had that marker a vote, it would be 0.2.
-    assert m.corner_bias_px < 0.08
+    assert m.errors.corner_px < 0.08
 
 
 def displaced(rows, by):

@@ -283,11 +283,6 @@ class MarkerMapper:
         return True
 
     @property
-    def corner_bias_px(self) -> float:
-        """Standard deviation of the corners' systematic error, as learned so far [px]."""
-        return self._bias.px
-
-    @property
     def candidates(self) -> dict[int, Candidate]:
         """Candidates: new markers that are not in the map yet, by ID."""
         return dict(self._new.candidates)
