@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.calibration.windows import PointWindows
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
 # Initial blur in steps of the grid, and its lower limit in pixels.
 _BLUR, _LEAST_BLUR = 0.06, 0.8
@@ -86,7 +86,7 @@ def _without_deviating(
     """
     every, contrast = windows, np.ones(len(parameters))
     for _ in range(_REWEIGHTED):
-        off = every.residuals(parameters, contrast) / np.maximum(every.weight, 1e-9)
+        off = every.residuals(parameters, contrast) / np.maximum(every.weight, TINY)
         windows = every.reweighted(1.0 / np.sqrt(1.0 + (off / (_DEVIATING * noise)) ** 2))
         state = _minimised(windows, parameters, 2, enough)
         parameters, contrast = state.parameters, state.contrast

@@ -11,7 +11,7 @@ from thermal_fiducial.calibration.keypoints import Keypoints
 from thermal_fiducial.calibration.placement import BoardNodes, goes_on, GridRefusal
 from thermal_fiducial.calibration.refusals import median_spacing, why_refused, why_unlike
 from thermal_fiducial.calibration.subpixel import refine, Refined
-from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, TINY
 from thermal_fiducial.errors import InputError
 
 # Largest deviation of the circles' width from the described one: the radius enters where the middle of an image of a
@@ -122,7 +122,7 @@ def _checked(
     wide = _of_another_width(refined, nodes, starts, appearance, tone_curve=known.tone_curve)
     if wide or len(kept) < _ALIKE * count:
         reason = why_unlike(image, refined.blur_px, nodes[:count], starts[:count])
-        wider = f'the circles are {refined.width / max(appearance.width, 1e-9):.2f} times as wide as described'
+        wider = f'the circles are {refined.width / max(appearance.width, TINY):.2f} times as wide as described'
         unlike = f'{len(kept)} of {count} points look as described: of other sizes, or another board'
         raise BoardNotFound(reason or (wider if wide else unlike))
     # Placed again, since rejected points may have been the only ones that determined the placement.

@@ -8,7 +8,7 @@ import numpy as np
 
 from thermal_fiducial.config import ImuNoise, parameters
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE, require_usable
+from thermal_fiducial.core.geometry.plausibility import is_rigid, LARGEST_COORDINATE, require_usable
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
@@ -156,8 +156,7 @@ def _numbers(value: Value, size: int, limit: float = np.inf) -> FloatArray:
 def _rigid(value: Value) -> FloatArray:
     """A rigid transform (4, 4) from 16 numbers, nested or not."""
     T = _numbers(value, 16, LARGEST_COORDINATE).reshape(4, 4)
-    R = T[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0.0 or not np.allclose(T[3], (0, 0, 0, 1)):
+    if not is_rigid(T) or not np.allclose(T[3], (0, 0, 0, 1)):
         raise value.error('no rigid transform')
     return T
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from thermal_fiducial.core.geometry.se3 import apply, skew, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, TINY
 from thermal_fiducial.errors import InputError
 
 # Points along a side of the grid that represents a marker in ICP.
@@ -153,7 +153,7 @@ def _step(markers: list[MapMarker], planes: dict[int, _Plane], T: FloatArray) ->
                                         -(plane.normal @ skew(points - middle))], axis=-1))  # fmt: skip
             residuals.append((points - plane.centre) @ plane.normal)
     J, r = np.concatenate(rows), np.concatenate(residuals)
-    scale = np.array([1.0] * 3 + [1.0 / max(float(np.abs(J[:, 3:]).max()), 1e-9)] * 3)
+    scale = np.array([1.0] * 3 + [1.0 / max(float(np.abs(J[:, 3:]).max()), TINY)] * 3)
     values, vectors = np.linalg.eigh((J * scale).T @ (J * scale))
     known = values > _OPEN * values[-1]
     step = vectors[:, known] @ ((vectors[:, known].T @ ((J * scale).T @ -r)) / values[known])

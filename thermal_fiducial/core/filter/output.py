@@ -112,7 +112,7 @@ class SmoothOutput:
         if self._consistent is None or odometry.stamp_ns <= self._consistent.stamp_ns:
             self._T, share = odometry.T_map_body, 0.0
         else:
-            dt = (odometry.stamp_ns - self._consistent.stamp_ns) * 1e-9
+            dt = (odometry.stamp_ns - self._consistent.stamp_ns) / SECOND_NS
             left = inverse(odometry.T_map_body) @ self._T @ _motion(self._consistent, odometry, dt)
             share = math.exp(-dt / self._seconds) if np.linalg.norm(left[:3, 3]) < LARGEST_STEP else 0.0
             rotation = so3_exp(share * so3_log(left[:3, :3]))
