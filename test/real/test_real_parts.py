@@ -12,15 +12,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.nightly, pytest.mark.usefixtures('re
 SECONDS = 15.0
 
 
-def part(flight, begin):
-    """``SECONDS`` of a flight from ``begin`` [s] on."""
-    first_ns = flight.samples[0].stamp_ns + round(1e9 * begin)
-    last_ns = first_ns + round(1e9 * SECONDS)
-    samples = [sample for sample in flight.samples if first_ns <= sample.stamp_ns < last_ns]
-    frames = {stamp: rows for stamp, rows in flight.frames.items() if first_ns <= stamp < last_ns}
-    return replace(flight, samples=samples, frames=frames)
-
-
 def with_left_half(flight):
     """Of the board's tags those left of the middle."""
     x = {key: marker.T_map_marker[0, 3] for key, marker in flight.marker_map.markers.items()}
@@ -63,7 +54,7 @@ def with_another_clock(flight):
 def test_claims_hold_in_parts_of_the_flight(changed, begin):
     """Judged by the other camera, with a lens and a board of its own."""
     stamps_ns, T_map_body = real_flights.board_reference('cam1')
-    flight = part(real_flights.april_board('cam0'), begin)
+    flight = real_flights.part(real_flights.april_board('cam0'), begin, SECONDS)
     run = fly(changed(flight))
     assert run.resets == 0
     # Measured 0.7 to 2.7 %: two poses of a start, of 75 to 300.

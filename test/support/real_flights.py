@@ -4,6 +4,7 @@ A folder has ``imu.csv``, corners a row a marker, ``rig.yaml``, and, the board, 
 """
 
 import csv
+from dataclasses import replace
 from functools import cache, partial
 import hashlib
 import os
@@ -77,6 +78,15 @@ def april_board(camera='cam0', sigma_px=BOARD_SIGMA_PX, seconds=_BOARD_S, every=
         size,
         ImuNoise(**published),
     )
+
+
+def part(flight, begin, seconds) -> CornerFlight:
+    """So many ``seconds`` of a flight from ``begin`` [s] on."""
+    first_ns = flight.samples[0].stamp_ns + round(1e9 * begin)
+    last_ns = first_ns + round(1e9 * seconds)
+    samples = [sample for sample in flight.samples if first_ns <= sample.stamp_ns < last_ns]
+    frames = {stamp: rows for stamp, rows in flight.frames.items() if first_ns <= stamp < last_ns}
+    return replace(flight, samples=samples, frames=frames)
 
 
 @cache
