@@ -6,8 +6,9 @@ import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.camera_frames import pixel_noise
+from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.detection.finding.search import BlindSearch, inside_out, SearchScales
-from thermal_fiducial.core.detection.patterns import Decoder, Reading, sampled, shrunk
+from thermal_fiducial.core.detection.patterns import Decoder, Dictionary, Reading, sampled, shrunk
 from thermal_fiducial.core.detection.prediction.frame import Frame, Places
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -38,8 +39,8 @@ def frame_of(image):
     return Frame(0, image, pixel_noise(image), camera, None, 0.0, 0.0)
 
 
-def search(image, config=None, allowed=EVERY):
-    return SEARCH.search(frame_of(image), allowed, config or ArucoDetectorConfig(), FoundMarkers.none())
+def search(image, config=None, allowed=EVERY, scales=SearchScales.ALL):
+    return SEARCH.search(frame_of(image), allowed, config or ArucoDetectorConfig(), FoundMarkers.none(), scales)
 
 
 def test_more_outlines_than_opencv_interpolates_at_once():
@@ -87,8 +88,14 @@ def in_plate(marker_id, contrast, surroundings):
     return (cv2.GaussianBlur(image, (0, 0), 0.7) + rng.normal(0.0, 1.0, image.shape)).astype(np.float32)
 
 
-def found_of_thirty(contrast, surroundings):
-    return sum(search(in_plate(k, contrast, surroundings)).ids.tolist() == [k] for k in range(30))
+def found_of_thirty(contrast, surroundings, scales=SearchScales.ALL):
+    return sum(search(in_plate(k, contrast, surroundings), scales=scales).ids.tolist() == [k] for k in range(30))
+
+
+def touching_flame(warmth):
+    flame = np.zeros((256, 320))
+    flame[90:140, 175:200] = warmth
+    return flame
 
 
 # When written: 29, 25, 25, 30 of 30; without a bound on what counts for the contrast 22, 1, none, none.
@@ -104,6 +111,28 @@ def test_the_edge_of_a_cold_sky_does_not_hide_a_marker():
     sky[:91] = -2000.0
     # 29 when written, none without the bound.
     assert found_of_thirty(8.0, sky) >= 24
+
+
+# When written: 30, 30, 26; unclipped 2, none, 7.
+@pytest.mark.parametrize(('contrast', 'warmth'), [(40.0, 20.0), (8.0, 100.0), (160.0, 20.0)])
+def test_a_flame_that_touches_a_plate_does_not_hide_it_where_counts_are_clipped(contrast, warmth):
+    assert found_of_thirty(contrast, touching_flame(contrast * warmth), SearchScales.ALL | SearchScales.CLIPPED) >= 22
+
+
+# When written: 30, 30, 29; unclipped 2, 8, 20.
+@pytest.mark.parametrize('contrast', [8.0, 20.0, 40.0])
+def test_the_edge_of_a_warm_panel_does_not_hide_a_plate_beside_it_where_counts_are_clipped(contrast):
+    panel = np.zeros((256, 320))
+    panel[:, :131] = 1000.0
+    assert found_of_thirty(contrast, panel, SearchScales.ALL | SearchScales.CLIPPED) >= 27
+
+
+def test_counts_are_clipped_in_turn_until_a_marker_is_found():
+    detector = MarkerDetector(ArucoDetectorConfig(), Dictionary(BITS, 1))
+    image = np.rint(in_plate(3, 40.0, touching_flame(800.0))).astype(np.uint16)
+    camera = frame_of(image).camera
+    ids = [detector.detect(frame * 33_333_333, image, camera)['id'].tolist() for frame in range(1, 5)]
+    assert ids == [[], [3], [3], [3]]
 
 
 def test_faint_markers_brighter_than_all_round_are_found():

@@ -56,7 +56,7 @@ class FrameHistory:
     saw_partial: bool = False
     #: stamp of the last frame that was searched blindly, and the resolutions that were used
     searched_ns: int | None = None
-    scales: SearchScales = SearchScales.ALL
+    scales: SearchScales = SearchScales.ALL | SearchScales.CLIPPED
     #: of the display, as far as it is known
     gray_scale: GrayScale = UNKNOWN_SCALE
 
@@ -115,7 +115,7 @@ class MarkerFinder:
         period = config.blind_period if holds else min(config.blind_period, _UNSURE_S)
         if (complete or holds) and history.searched_within(frame.stamp_ns, period):
             return found, history
-        scales = _next_scales(history, complete=complete)
+        scales = _next_scales(history, found, complete=complete)
         blind = self._blind(frame, history, found, scales, known, in_map, config)
         return found.and_elsewhere(blind), replace(history, searched_ns=frame.stamp_ns, scales=scales)
 
@@ -189,11 +189,18 @@ class MarkerFinder:
         return np.asarray(np.isin(np.arange(self._decoder.count), wanted))
 
 
-def _next_scales(history: FrameHistory, *, complete: bool) -> SearchScales:
-    """Both resolutions; one in turn where all predicted markers were found with high contrast."""
+def _next_scales(history: FrameHistory, found: FoundMarkers, *, complete: bool) -> SearchScales:
+    """Both resolutions; one in turn where all predicted markers were found with high contrast.
+
+    Where none is ``found`` at its prediction, counts are clipped every other time until markers show: clipped ones show
+    those that touch a flame or are beside a panel, others those in motion blur, both ends of which would be clipped.
+    """
+    last, shown = history.scales, len(history.track.markers.ids) > 0
+    if len(found.ids) == 0 and (SearchScales.CLIPPED in last) == shown:
+        return SearchScales.ALL | SearchScales.CLIPPED
     if not (complete and history.track.all_clearer_than(CLEAR_CNR)):
         return SearchScales.ALL
-    return SearchScales.FAINT if history.scales == SearchScales.FINE else SearchScales.FINE
+    return SearchScales.FAINT if last == SearchScales.FINE else SearchScales.FINE
 
 
 def followed(

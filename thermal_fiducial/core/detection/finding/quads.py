@@ -17,6 +17,11 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 
 # Window of the local standard deviation, at a quarter of the resolution: 68 px, a marker at working distance.
 _LOCAL = 17
+_WINDOW = np.ones((_LOCAL, _LOCAL), dtype=np.uint8)
+# Odd width of the median before the background is taken, the largest that OpenCV has for floating-point numbers.
+_MEDIAN = 5
+# Share of the range within which the background is about its mean: two standard deviations of the noise.
+_NO_EDGE = 0.1
 # Standard deviation over mean absolute deviation, of a Gaussian.
 _STD_OF_MEAN = math.sqrt(0.5 * math.pi)
 # Odd width of the median filter that removes specks.
@@ -100,6 +105,21 @@ class DarkRegions:
         self._mask = cv2.compare(self._smooth, limit, cv2.CMP_LT, dst=self._mask)
         # Specks of noise are many, and each is an outline to follow.
         return np.asarray(cv2.medianBlur(self._mask, _SPECKS, dst=self._mask))
+
+
+def about_background(counts: Float32Array, most: float) -> Float32Array:
+    """Deviations of ``counts`` (height, width) from the background, clipped at ``most``.
+
+    The background is what is larger than a window: an opening and closing follows the edges of a panel or of the sky,
+    and leaves out flames and markers (J. Serra, "Image Analysis and Mathematical Morphology", 1982). It has the least
+    and the most of the noise, so that a median is taken before, and the mean where it has no such edge.
+    """
+    opened = cv2.morphologyEx(cv2.medianBlur(halved(counts), _MEDIAN), cv2.MORPH_OPEN, _WINDOW)
+    background = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _WINDOW)
+    mean = cv2.blur(background, (_LOCAL, _LOCAL))
+    background = np.where(cv2.absdiff(background, mean) < _NO_EDGE * most, mean, background)
+    deviation = counts - cv2.resize(background, counts.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    return np.asarray(np.clip(deviation, -most, most, out=deviation))
 
 
 def dark_in_picture(picture: Float32Array, noise: float) -> Gray:

@@ -9,6 +9,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.camera_frames import with_columns_corrected
 from thermal_fiducial.core.detection.corners.pattern_fit import aligned
 from thermal_fiducial.core.detection.finding.quads import (
+    about_background,
     dark_in_picture,
     DarkRegions,
     find_quads,
@@ -25,6 +26,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.
 _FINE = Scale(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5, most=60.0)
 _FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0, most=40.0)
+# Deviation from the background at which counts are clipped, in standard deviations of the noise at half resolution.
+_RANGE = 20.0
 # Correlation from which an outline needs no alignment; least correlation, and its margin, for alignment to be tried.
 _CLEAR = 0.95
 _HINT, _HINT_MARGIN = 0.6, 0.06
@@ -40,10 +43,11 @@ _NONE = np.zeros(0, dtype=np.intp)
 
 
 class SearchScales(Flag):
-    """Resolutions of the blind search."""
+    """Resolutions of the blind search, and whether counts are clipped about the background at half resolution."""
 
     FINE = auto()
     FAINT = auto()
+    CLIPPED = auto()
     ALL = FINE | FAINT
 
 
@@ -90,12 +94,13 @@ class BlindSearch:
         if frame.displayed:
             min_side_px, edge_px = _PICTURE_SIDE * config.min_side_px, 0.0
         fine = faint = np.zeros((0, 4, 2))
-        half, clear = frame.image, scales != SearchScales.ALL
+        half, clear = frame.image, SearchScales.ALL not in scales
         if SearchScales.FINE in scales:
             fine = find_quads(self._fine_mask(frame, clear=clear), min_side_px, hidden, edge_px)
         if SearchScales.FAINT in scales:
             half = with_columns_corrected(halved(frame.image), 0.5 * frame.noise)
-            masks = (self._faint.mask(half if kind > 0.0 else -half, 0.5 * frame.noise, clear=clear) for kind in kinds)
+            near = about_background(half, 0.5 * _RANGE * frame.noise) if SearchScales.CLIPPED in scales else half
+            masks = (self._faint.mask(near if kind > 0.0 else -near, 0.5 * frame.noise, clear=clear) for kind in kinds)
             outlines = [find_quads(mask, 0.5 * config.min_side_px + 2.0, halfway(hidden)) for mask in masks]
             faint = 2.0 * np.concatenate(outlines) + 0.5
         if len(fine) + len(faint) == 0:
