@@ -8,6 +8,7 @@ import pytest
 from support.scenes import camera_of, detector_of, motion_prior
 
 from thermal_fiducial.core.detection.prediction.tracking import MotionTrack, predict_frame
+from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.sim.scenario import named
 from thermal_fiducial.sim.thermal_camera import render_frames
@@ -81,6 +82,24 @@ def test_an_unknown_clock_offset_widens_the_predicted_motion_and_pose():
     assert calibrated.position_std_m == pytest.approx(np.hypot(known.position_std_m, 0.002), rel=1e-6)
     assert np.sqrt(known.twist.covariance[0, 0]) < 0.02
     assert 0.08 < np.sqrt(unknown.twist.covariance[0, 0]) < 0.3
+
+
+def test_a_velocity_that_the_filter_does_not_know_blurs_no_frame():
+    """Markers of the last frame say more; without them nothing does, which is a brisk flight of 1.5 m/s."""
+    moving = Twist(np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0]), 1e-4 * np.eye(6))
+    before_ns = STAMP_NS - 33_333_333
+    track = MotionTrack(np.eye(4), 0.010, before_ns, moving, last_seen_ns=before_ns)
+
+    def by(std, track):
+        covariance = np.diag([std**2] * 3 + [1e-4] * 3)
+        wrong = (replace(state, velocity_body=np.full(3, -4.0), twist_covariance=covariance) for state in states())
+        return predict_frame(STAMP_NS, motion_prior(*wrong), track, 0.03).twist
+
+    np.testing.assert_allclose(by(0.05, track).value[:3], -4.0)
+    np.testing.assert_allclose(by(3.0, track).value, moving.value, atol=1e-9)
+    unknown = MotionTrack(np.eye(4), 0.010)
+    np.testing.assert_allclose(by(0.5, unknown).value[:3], -4.0)
+    assert by(3.0, unknown) is None
 
 
 def test_impossible_odometry_is_left_alone():

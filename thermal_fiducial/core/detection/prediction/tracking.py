@@ -197,9 +197,15 @@ def predict_frame(
         states = prior.between(odometry_ns - _LONGEST_NS, odometry_ns + lag_ns, _STATES)
     if not states and (other := prior.nearest(odometry_ns)) is not None:
         states = [other]
+    twist = track.predict(stamp_ns)
     if not states or abs(odometry_ns - states[-1].stamp_ns) >= _STALE_NS:
-        return FramePrediction(track.predict(stamp_ns), None, math.inf)
-    twist = twist_by_odometry(odometry_ns, states, twist_transfer(track.T_body_camera), track.lag, clock_std_s)
+        return FramePrediction(twist, None, math.inf)
+    by_odometry = twist_by_odometry(odometry_ns, states, twist_transfer(track.T_body_camera), track.lag, clock_std_s)
+    # That of a filter which is lost says less than the markers of the last frames, or than nothing.
+    if np.trace(by_odometry.covariance) < np.trace((twist or UNKNOWN_TWIST).covariance):
+        twist = by_odometry
+    if twist is None:
+        return FramePrediction(None, None, math.inf)
     nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns))
     dt = (odometry_ns - nearest.stamp_ns) / SECOND_NS
     pose = extrapolated(nearest, dt, stamp_ns, track.T_body_camera, clock_std_s).pose
