@@ -30,11 +30,8 @@ MODELS = {
 _STEPS, _SHORT = 12, 1e-6
 # Widest angle off the optical axis at which markers are looked for: normalised coordinates end at a right angle.
 _WIDEST = math.radians(85.0)
-# The same as a share of the normalised radius at which a lens folds back: from there on the image of a step outwards is
-# less than a fifth as long as in the middle.
-_BEFORE_FOLD = 0.9
-# Least length of a step of the angle in the image, as a share of its length in the middle, also of lenses that nearly
-# fold; number of angles that are looked at.
+# Least length of a step of the angle in the image, as a share of its length in the middle: less is left where a lens
+# folds back, or nearly does; number of angles that are looked at.
 _LEAST_STEP, _ANGLES = 0.2, 171
 # A last coefficient below this has no root at any angle that a lens can have, but makes the others' overflow.
 _NO_COEFFICIENT = 1e-15
@@ -209,7 +206,7 @@ class Camera:
         return np.asarray(((uv >= margin_px) & (uv <= last)).all(axis=-1))
 
     def shows(self, uv: npt.ArrayLike) -> BoolArray:
-        """Whether pixels (..., 2) show what lies less than 85 degrees off the axis and before the lens folds back."""
+        """Whether pixels (..., 2) show what is less than 85 degrees off the axis, before the lens nearly folds back."""
         off_axis = np.asarray(uv, dtype=np.float64) - self.K[:2, 2]
         if self._shown_px == math.inf:
             return np.ones(off_axis.shape[:-1], dtype=np.bool_)
@@ -218,8 +215,7 @@ class Camera:
     @cached_property
     def _shown_px(self) -> float:
         """Radius [px] around the principal point that the lens shows; inf if that is all of the image."""
-        radius = min(_BEFORE_FOLD * self._fold_radius, math.tan(self._steep_angle))
-        shown = float(self._radii_px(np.array([radius]))[0])
+        shown = float(self._radii_px(np.array([math.tan(self._steep_angle)]))[0])
         corners = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]]) * self._last_pixel
         return shown if np.linalg.norm(corners - self.principal_point, axis=1).max() > shown else math.inf
 

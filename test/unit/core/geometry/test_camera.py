@@ -138,8 +138,9 @@ def test_a_fisheye_is_inverted_to_half_a_degree_from_the_hemisphere(D):
     [
         # The hemisphere ends 157 px from the centre, 85 degrees are at 148 px.
         ('equidistant', [0.0], 100.0 * np.radians(85.0)),
-        # x (1 - 0.3 x^2) folds back at x = 1.054; nine tenths of it are at 69.3 px.
-        ('plumb_bob', [-0.3], 100.0 * 0.9 * 1.0541 * (1.0 - 0.3 * (0.9 * 1.0541) ** 2)),
+        # x (1 - 0.3 x^2) folds back at x = 1.054. Steps of the angle are a fifth of those in the middle at x = 1:
+        # (1 + x^2) (1 - 0.9 x^2) = 0.2.
+        ('plumb_bob', [-0.3], 100.0 * 1.0 * (1.0 - 0.3)),
     ],
 )
 def test_pixels_beyond_what_the_lens_can_show(model, D, radius):
