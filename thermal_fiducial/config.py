@@ -654,16 +654,22 @@ class ImuNoise(SelfChecked):
         2.0e-3, 'Accelerometer white noise.', unit='m/s^2/sqrt(Hz)', minimum=0.0, maximum=1.0
     )
     gyroscope_random_walk: float = param(
+        2.0e-5, 'Gyroscope bias random walk.', unit='rad/s^2/sqrt(Hz)', minimum=0.0, maximum=0.01
+    )
+    accelerometer_random_walk: float = param(
+        3.0e-4, 'Accelerometer bias random walk.', unit='m/s^3/sqrt(Hz)', minimum=0.0, maximum=0.1
+    )
+    gyroscope_instability: float = param(
         2.0e-4,
-        'Gyroscope bias random walk in flight: more than at rest, by temperature and vibration.',
-        unit='rad/s^2/sqrt(Hz)',
+        'Gyroscope bias instability (flicker noise) in flight: more than at rest, by temperature and vibration.',
+        unit='rad/s',
         minimum=0.0,
         maximum=0.01,
     )
-    accelerometer_random_walk: float = param(
+    accelerometer_instability: float = param(
         0.01,
-        'Accelerometer bias random walk in flight: more than at rest, by temperature and vibration.',
-        unit='m/s^3/sqrt(Hz)',
+        'Accelerometer bias instability (flicker noise) in flight: more than at rest, by temperature and vibration.',
+        unit='m/s^2',
         minimum=0.0,
         maximum=0.1,
     )

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.imu_noise import bias_walks
 from thermal_fiducial.core.filter.initialization import blank_state
 from thermal_fiducial.core.filter.update import body_pose
 from thermal_fiducial.core.geometry.se3 import so3_exp
@@ -77,7 +78,7 @@ class Flown:
         for step, dt in self.steps(self.times[index - 1], self.times[index]):
             integrate(preintegrated, step, dt)
         keys = (X(index - 1), V(index - 1), X(index), V(index), B(index - 1))
-        walk = np.repeat((noise.accelerometer_random_walk, noise.gyroscope_random_walk), 3)
+        walk = np.repeat(bias_walks(noise)[::-1], 3)
         seconds = (self.times[index] - self.times[index - 1]) * 1e-9
         sigmas = gtsam.noiseModel.Diagonal.Sigmas(walk * np.sqrt(seconds))
         still = gtsam.imuBias.ConstantBias()

@@ -10,6 +10,7 @@ import numpy as np
 
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.filter.imu_noise import bias_walks
 from thermal_fiducial.core.geometry.se3 import (
     rotation_angle,
     skew,
@@ -27,7 +28,7 @@ CAMERA_ORIENTATION = (-0.5, 0.5, -0.5, 0.5)
 R_BODY_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 T_BODY_CAMERA = transform(R_BODY_CAMERA, CAMERA_POSITION)
 #: Its biases walk as those of a good IMU at rest.
-IMU = ImuNoise(gyroscope_random_walk=2.0e-5, accelerometer_random_walk=3.0e-4)
+IMU = ImuNoise(gyroscope_instability=0.0, accelerometer_instability=0.0)
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Flight:
         motion = self.motion or Motion.random(rng)
         t = np.arange(round(self.seconds * self.imu_rate)) / self.imu_rate
         quiet = 0.0 if self.noiseless else 1.0
-        walks = np.repeat((self.imu_noise.gyroscope_random_walk, self.imu_noise.accelerometer_random_walk), 3)
+        walks = np.repeat(bias_walks(self.imu_noise), 3)
         white = np.repeat((self.imu_noise.gyroscope_noise_density, self.imu_noise.accelerometer_noise_density), 3)
         steps = rng.normal(size=(len(t), 6)) * walks / np.sqrt(self.imu_rate)
         bias = quiet * (np.repeat(self.bias_std, 3) * rng.normal(size=6) + np.cumsum(steps, axis=0))

@@ -26,6 +26,7 @@ def simulated(name, seed=0, seconds=None) -> CornerFlight:
         sizes = np.full(len(frame.ids), rig.marker_size)
         frames[frame.stamp_ns] = rows_from_corners(frame.ids, frame.corners_px, covariances, sizes, rig.camera)
     noise = scenario.imu.noise
+    # Of a Gauss-Markov process with a time of 2 s, its deviation times the root of 2 / 2 s: the walk that drives it.
     return CornerFlight(
         f'{name}, seed {seed}',
         recording.samples,
@@ -40,6 +41,8 @@ def simulated(name, seed=0, seconds=None) -> CornerFlight:
             accelerometer_noise_density=noise.accelerometer_noise_density,
             gyroscope_random_walk=noise.gyroscope_random_walk,
             accelerometer_random_walk=noise.accelerometer_random_walk,
+            gyroscope_instability=scenario.imu.gyroscope_instability,
+            accelerometer_instability=scenario.imu.accelerometer_instability,
         ),
         rig.time_offset,
     )

@@ -243,6 +243,8 @@ def test_what_does_not_fit_is_refused_by_name(values, words):
         (lambda: ImuNoise(accelerometer_noise_density=2.0), 'accelerometer_noise_density: 2.0 is outside'),
         (lambda: ImuNoise(gyroscope_random_walk=0.02), 'gyroscope_random_walk: 0.02 is outside'),
         (lambda: ImuNoise(accelerometer_random_walk=0.3), 'accelerometer_random_walk: 0.3 is outside'),
+        # A data sheet's 0.25 mg.
+        (lambda: ImuNoise(accelerometer_instability=0.25), 'accelerometer_instability: 0.25 is outside'),
         (lambda: ImuNoise(vibration=-1.0), 'parameter vibration: -1.0 is outside'),
         (lambda: ArucoDetectorConfig(marker_size_overrides=('7',)), 'parameter marker_size_overrides'),
         (lambda: ArucoDetectorConfig(marker_size_overrides=(7,)), 'parameter marker_size_overrides: 7 is not of type'),

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ImuNoise
+from thermal_fiducial.core.filter.imu_noise import bias_walks
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.types import FloatArray
 
@@ -81,8 +82,7 @@ class ImuTrack:
         return SampleNoise(
             max(rate, known.gyroscope_noise_density),
             max(force, known.accelerometer_noise_density),
-            known.gyroscope_random_walk,
-            known.accelerometer_random_walk,
+            *bias_walks(known),
         )
 
 

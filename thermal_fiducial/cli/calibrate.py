@@ -77,6 +77,8 @@ def _add_camera_imu(parser: Parser) -> None:
         ('accelerometer_noise_density', 'm/s^2/sqrt(Hz)'),
         ('gyroscope_random_walk', 'rad/s^2/sqrt(Hz)'),
         ('accelerometer_random_walk', 'm/s^3/sqrt(Hz)'),
+        ('gyroscope_instability', 'rad/s'),
+        ('accelerometer_instability', 'm/s^2'),
     ):
         default = getattr(noise, name)
         parser.add_argument(
@@ -95,6 +97,8 @@ def _camera_imu(args: argparse.Namespace) -> int:
         args.accelerometer_noise_density,
         args.gyroscope_random_walk,
         args.accelerometer_random_walk,
+        args.gyroscope_instability,
+        args.accelerometer_instability,
     )
     marker_map = load_map(args.map)
     with BagReader(args.bag, parse_remaps(args.remap)) as bag:

@@ -68,7 +68,7 @@ def calibrate_imu(args: argparse.Namespace) -> int:
 def noise_text(fit: 'ImuNoiseFit') -> str:
     """Parameter file of the nodes: the rms of the three axes, with each axis as a comment.
 
-    Random walks are at least the default ones: those of flight do not show at rest.
+    Bias instabilities are at least the default ones: those of flight do not show at rest.
     """
     usual = ImuNoise()
     lines = [
@@ -81,14 +81,14 @@ def noise_text(fit: 'ImuNoiseFit') -> str:
     for name, values, least in (
         ('gyroscope_noise_density', fit.gyroscope.white, 0.0),
         ('accelerometer_noise_density', fit.accelerometer.white, 0.0),
-        ('gyroscope_random_walk', fit.gyroscope.walk, usual.gyroscope_random_walk),
-        ('accelerometer_random_walk', fit.accelerometer.walk, usual.accelerometer_random_walk),
+        ('gyroscope_random_walk', fit.gyroscope.walk, 0.0),
+        ('accelerometer_random_walk', fit.accelerometer.walk, 0.0),
+        ('gyroscope_instability', fit.gyroscope.instability, usual.gyroscope_instability),
+        ('accelerometer_instability', fit.accelerometer.instability, usual.accelerometer_instability),
     ):
         axes, found = ', '.join(f'{value:.2e}' for value in values), rms(values)
         remark = '' if found >= least else f'in flight; at rest {found:.1e} '
         lines.append(f'      {name}: {max(found, least):.4e}  # {remark}({axes})')
-    for name, sensor in (('gyroscope', fit.gyroscope), ('accelerometer', fit.accelerometer)):
-        lines.append(f'# bias instability of the {name}: {rms(sensor.instability):.2e}')
     return '\n'.join(lines) + '\n'
 
 

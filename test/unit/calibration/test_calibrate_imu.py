@@ -63,11 +63,12 @@ def test_the_command_writes_parameters(tmp_path, capsys):
     written = yaml.safe_load(out.read_text())['/**']['ros__parameters']['imu']
     assert set(written) == {
         'gyroscope_noise_density', 'accelerometer_noise_density', 'gyroscope_random_walk', 'accelerometer_random_walk',
+        'gyroscope_instability', 'accelerometer_instability',
     }  # fmt: skip
     settings = read_settings(out, {})
     assert settings.pose_ekf.imu.gyroscope_noise_density == pytest.approx(3e-3, rel=0.05)
-    # At rest biases walk less than in flight.
-    assert settings.pose_ekf.imu.accelerometer_random_walk == ImuNoise().accelerometer_random_walk
+    # At rest biases change less than in flight.
+    assert settings.pose_ekf.imu.accelerometer_instability == ImuNoise().accelerometer_instability
     assert settings.pose_ekf.gravity == PoseEkfConfig().gravity
     printed = capsys.readouterr().out
     assert '1.28 s: ' in printed

@@ -27,6 +27,9 @@ _MOTION_TIME = 1.0
 _SATURATED = 5.0, 150.0
 #: Gaps [s] interrupt the spectrum; their interpolation error is added.
 _GAP = GAP_NS / SECOND_NS
+#: Time [s] in which poses show a bias: 20 a second, white to a millimetre, show an acceleration to 6 mm/s^2. Faster
+#: flicker moves position by less than they show.
+_BIAS_SHOWS = 1.0
 #: Number of bands, and their lowest and highest frequency [Hz]: above the motion, below the IMU's own low-pass filter.
 #: The quietest band is the floor of the spectrum: rotor tones leave at least one band nearly untouched.
 _BANDS, _LOWEST, _HIGHEST = 4, 12.5, 50.0
@@ -34,6 +37,19 @@ _BANDS, _LOWEST, _HIGHEST = 4, 12.5, 50.0
 _WINDOW, _OVERLAPPING, _MEAN_OF = 0.32, 4, 12
 #: Change of the mean step beyond which samples come at another rate: bursts and lost samples change it by less.
 _OTHER_RATE = 1.3
+
+
+def bias_walks(noise: ImuNoise) -> tuple[float, float]:
+    """Random walks of the biases of gyroscope and accelerometer [rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz)].
+
+    Bias instability is flicker noise, whose spectral density is B^2 / (2 pi f) (IEEE Std 952-1997, annex B). That of a
+    random walk is K^2 / (2 pi f)^2, with K = B / sqrt(T) the larger one at frequencies below 1 / (2 pi T).
+    """
+    root = math.sqrt(_BIAS_SHOWS)
+    return (
+        math.hypot(noise.gyroscope_random_walk, noise.gyroscope_instability / root),
+        math.hypot(noise.accelerometer_random_walk, noise.accelerometer_instability / root),
+    )
 
 
 class ImuNoiseMonitor:

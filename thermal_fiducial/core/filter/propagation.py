@@ -16,6 +16,7 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.imu_buffer import Steps
+from thermal_fiducial.core.filter.imu_noise import bias_walks
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
     BIAS,
@@ -76,8 +77,7 @@ def step_matrices(imu: FloatArray, seconds: FloatArray) -> StepMatrices:
 def random_walks(config: PoseEkfConfig) -> FloatArray:
     """Squared densities (54,) of the random walks of the parameters."""
     walks = np.zeros(SIZE)
-    walks[GYROSCOPE_BIAS] = config.imu.gyroscope_random_walk
-    walks[ACCELEROMETER_BIAS] = config.imu.accelerometer_random_walk
+    walks[GYROSCOPE_BIAS], walks[ACCELEROMETER_BIAS] = bias_walks(config.imu)
     walks[TIME_OFFSET] = config.time_offset_random_walk
     return np.square(walks)
 
