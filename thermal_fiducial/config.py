@@ -60,7 +60,7 @@ def param(
     verify : called with the value; raises InputError if it is unusable
     path : whether the string may be a path, in which a leading ~ is the user's home: no shell replaces it there
     dynamic : whether it may be set while the node runs; otherwise it is declared read-only
-    needs : parameters of the same node without which this one has no effect; "a or b": one of the two
+    needs : parameters of the same node without which this one has no effect
     """
     if needs:
         description += f' Needs {" and ".join(needs)}.'
@@ -118,7 +118,7 @@ def without_effect(config: Any) -> list[str]:
     lines = []
     values = {name: value for name, _, value in parameters(config)}
     for name, item, value in parameters(config):
-        missing = [need for need in item.metadata['needs'] if not any(values[other] for other in need.split(' or '))]
+        missing = [need for need in item.metadata['needs'] if not values[need]]
         if missing and value != item.default:
             lines.append(f'parameter {name}: no effect without {" and ".join(missing)}')
     return lines
@@ -735,11 +735,6 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         minimum=0.0,
         maximum=0.01,
     )
-    estimate_extrinsics: bool = param(
-        False,
-        'Estimate the errors of camera_position and camera_orientation; otherwise they are counted in the covariance.',
-        needs=('extrinsics_position_std or extrinsics_orientation_std',),
-    )
     extrinsics_position_std: float = param(
         0.002,
         'Standard deviation of camera_position: what its calibration leaves. 0: exact.',
@@ -748,8 +743,9 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         maximum=1.0,
     )
     extrinsics_orientation_std: float = param(
-        0.002,
-        'Standard deviation of camera_orientation: what its calibration leaves. 0: exact.',
+        0.005,
+        'Standard deviation of camera_orientation about each axis: what its calibration leaves; the default is that of '
+        'a bracket measured by hand. 0: exact.',
         unit='rad',
         minimum=0.0,
         maximum=1.0,

@@ -465,23 +465,13 @@ def test_scale_errors_of_the_gyroscope_are_learned(seed):
     assert nees < 6.0 < 4.0 * 6.0 < nees_ignored
 
 
-def test_extrinsics_are_refined_on_request():
-    # Twenty seconds: part of what a wrong lever arm does may be systematic errors of the poses, too.
-    data = flight(SEEDS[1], seconds=20.0)
-    wrong = np.add(config().camera_position, (0.01, -0.01, 0.01))
-    # What turns show of the lever arm they show of an unknown scale of the gyroscope too: this one is calibrated.
-    imu = ImuNoise(gyroscope_scale_std=0.0)
-    measured_by_hand = config(
-        camera_position=tuple(wrong),
-        estimate_extrinsics=True,
-        extrinsics_position_std=0.02,
-        extrinsics_orientation_std=0.02,
-        imu=imu,
-    )
-    _, _, ekf, _ = flown(data, measured_by_hand)
-    before = np.linalg.norm(wrong - config().camera_position)
-    after = np.linalg.norm(ekf.state.T_body_camera[:3, 3] - config().camera_position)
-    assert after < 0.6 * before
+def test_extrinsics_that_may_be_off_cost_no_accuracy():
+    """How well they are known widens the covariance alone: the poses do not show it."""
+    data = flight(SEEDS[1], seconds=8.0)
+    exact, vague = (flown(data, config(extrinsics_orientation_std=std)) for std in (0.0, 0.02))
+    # The clock's second order is left: 5.0 and 5.0 mm. With a gain that depends on it 14 mm.
+    assert rms(vague[0]) < 1.1 * rms(exact[0])
+    assert all(np.trace(state.pose_covariance[3:, 3:]) > 0.02**2 for state in vague[3])
 
 
 def test_smooth_output_has_no_steps_and_arrives():

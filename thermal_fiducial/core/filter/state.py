@@ -29,7 +29,7 @@ GYROSCOPE_MATRIX, ACCELEROMETER_MATRIX, SCALES = slice(15, 24), slice(24, 33), s
 GRAVITY = slice(33, 35)
 #: clock offset [s],
 TIME_OFFSET = 35
-#: T_body_camera, perturbed from the left [rad, m]; a consider parameter unless ``estimate_extrinsics``,
+#: T_body_camera, perturbed from the left [rad, m]: consider parameters, whose values stay those of the parameters,
 EXTRINSICS = slice(36, 42)
 #: systematic error of the camera poses, which lasts as long as the view, in the robot frame [rad, m],
 SYSTEMATIC = slice(42, 48)
@@ -107,18 +107,16 @@ class NavigationState:
         return replace(self.moved(error[CORE]), T_map_markers=T_map_markers)
 
     def plus(self, error: FloatArray) -> 'NavigationState':
-        """The state corrected by ``error`` (54,): X Exp(xi) for the group part, a sum for the rest."""
-        T_body_camera = self.T_body_camera
-        if error[EXTRINSICS].any():
-            turn, shift = error[EXTRINSICS][:3], error[EXTRINSICS][3:]
-            T_body_camera = transform(so3_exp(turn), so3_left_jacobian(turn) @ shift) @ T_body_camera
+        """The state corrected by ``error`` (54,): X Exp(xi) for the group part, a sum for the rest.
+
+        The extrinsics stay as they are.
+        """
         return replace(
             self.moved_in_map(error),
             bias=self.bias + error[BIAS],
             scale=self.scale + error[SCALES].reshape(2, 3, 3),
             gravity=with_horizontal(self.gravity, self.gravity[:2] + error[GRAVITY]),
             time_offset=self.time_offset + float(error[TIME_OFFSET]),
-            T_body_camera=T_body_camera,
             systematic=self.systematic + error[SYSTEMATIC],
         )
 
@@ -152,6 +150,13 @@ class Estimate:
     def std(self, place: slice | int) -> float:
         """Root of the sum of the variances of some coordinates: relative to the map, as poses show them."""
         return math.sqrt(float(self.covariance.diagonal()[place].sum()))
+
+    @property
+    def of_extrinsics(self) -> FloatArray:
+        """(54, 6) errors of the estimate by a standard deviation of each of the extrinsics."""
+        with_each = self.covariance[:, EXTRINSICS]
+        stds = np.sqrt(with_each[EXTRINSICS].diagonal())
+        return np.divide(with_each, stds, out=np.zeros_like(with_each), where=stds > 0.0)
 
     @property
     def position_std(self) -> float:

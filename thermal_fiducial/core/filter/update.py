@@ -65,6 +65,9 @@ class Innovation(NamedTuple):
     S_inverse: FloatArray
     H: FloatArray
     R: FloatArray
+    #: (54, 6) errors of the prior by a standard deviation of each of the extrinsics; S (6, 6) if these were exact
+    of_extrinsics: FloatArray
+    S_exact: FloatArray
 
     @property
     def nis(self) -> float:
@@ -138,7 +141,12 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
         H[:, MARKERS] = _by_map(prior.state.moved_in_map(error))
         S = H @ prior.covariance @ H.T + R
     S_inverse = np.asarray(np.linalg.inv(S))
-    return Innovation(estimate, pose, motion, prior, derivative, units, value, S, S_inverse, H, R)
+    of_extrinsics = prior.of_extrinsics
+    shown = H @ of_extrinsics
+    S_exact = S - shown @ shown.T
+    return Innovation(
+        estimate, pose, motion, prior, derivative, units, value, S, S_inverse, H, R, of_extrinsics, S_exact
+    )
 
 
 def with_covariance(config: PoseEkfConfig, innovation: Innovation, covariance: FloatArray) -> Innovation:
@@ -150,7 +158,7 @@ def with_covariance(config: PoseEkfConfig, innovation: Innovation, covariance: F
 def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
     """The estimate after an accepted pose."""
     prior, before = innovation.prior, innovation.derivative
-    error, covariance = _gained(config, innovation)
+    error, covariance = _gained(innovation)
     state = prior.state.plus(error)
     if config.estimate_time_offset:
         now = state.derivative(innovation.motion.imu)
@@ -162,7 +170,7 @@ def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
 
 def adapted_noise(innovation: Innovation) -> PoseNoise:
     """The noise of poses adapted to the innovation of an accepted or refused one: otherwise it would stay refused."""
-    return innovation.prior.pose_noise.adapted(innovation.units, innovation.value, innovation.S)
+    return innovation.prior.pose_noise.adapted(innovation.units, innovation.value, innovation.S_exact)
 
 
 def with_unknown_clock(config: PoseEkfConfig, covariance: FloatArray) -> FloatArray:
@@ -255,7 +263,7 @@ def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, inno
     followed = innovation.derivative - now
     half = np.outer(followed, with_offset + 0.5 * variance * embedded_core(followed))
     noise = np.repeat((motion.rate_variance, motion.velocity_variance), 3)
-    spurious = _SPURIOUS * float(innovation.S_inverse.diagonal() @ noise)
+    spurious = _SPURIOUS * float(np.linalg.inv(innovation.S_exact).diagonal() @ noise)
     widest = max(variance, config.time_offset_std**2)
     consistent = min(variance / max(1.0 - variance * spurious, _LEAST_KEPT), widest)
     by_offset = clock_offset_derivative(now)
@@ -265,17 +273,21 @@ def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, inno
     return P
 
 
-def _gained(config: PoseEkfConfig, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
-    """Kalman update: the corrected error (54,) and the covariance (54, 54)."""
-    algebra, P = copy(_ALGEBRA), innovation.prior.covariance
-    algebra.x, algebra.P = np.zeros(SIZE), P
+def _gained(innovation: Innovation) -> tuple[FloatArray, FloatArray]:
+    """Kalman update: the corrected error (54,) and the covariance (54, 54).
+
+    The gain is that of exact extrinsics, so the estimate does not depend on how well they are said to be known; the
+    covariance has all that their errors do to it.
+    """
+    algebra, of_extrinsics = copy(_ALGEBRA), innovation.of_extrinsics
+    exact = innovation.prior.covariance - of_extrinsics @ of_extrinsics.T
+    # Where rounding leaves variances below zero, they would grow with each update.
+    exact[EXTRINSICS], exact[:, EXTRINSICS] = 0.0, 0.0
+    algebra.x, algebra.P = np.zeros(SIZE), exact
     algebra.update(innovation.value, lambda _: innovation.H, lambda _: np.zeros(6), R=innovation.R)
-    gain, covariance = algebra.K, 0.5 * (algebra.P + algebra.P.T)
-    if not config.estimate_extrinsics:
-        # A consider parameter (S. Schmidt, 1966): its cross-covariances change, itself it does not.
-        gain[EXTRINSICS] = 0.0
-        covariance[EXTRINSICS, EXTRINSICS] = P[EXTRINSICS, EXTRINSICS]
-    return _iterated(innovation, gain), covariance
+    of_extrinsics = of_extrinsics - algebra.K @ (innovation.H @ of_extrinsics)
+    covariance = 0.5 * (algebra.P + algebra.P.T) + of_extrinsics @ of_extrinsics.T
+    return _iterated(innovation, algebra.K), covariance
 
 
 def _iterated(innovation: Innovation, gain: FloatArray) -> FloatArray:

@@ -37,7 +37,7 @@ from thermal_fiducial.core.geometry.reprojection import lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN
 
-FULL = config(estimate_extrinsics=True, stamp_jitter=0.0, mount_vibration=0.0)
+FULL = config(stamp_jitter=0.0, mount_vibration=0.0)
 RATE = np.array([0.5, -1.0, 0.7])
 
 
