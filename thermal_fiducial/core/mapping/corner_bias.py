@@ -14,13 +14,15 @@ from thermal_fiducial.core.types import FloatArray, TINY
 
 #: Systematic errors of corners: weight of the prior in frames, and forgetting factor per frame, a memory of 300 frames.
 BIAS_PRIOR, BIAS_MEMORY = 5.0, 1.0 - 1.0 / 300.0
-#: Residuals of a marker beyond this many standard deviations of the bias count as so many.
+#: Residuals of a marker beyond this many standard deviations of the bias count as so many; in a fit, of bias and noise.
 BIAS_OUTLIER = 2.0
 #: Variance of a marker's shape, in units of the noise, beyond which it counts as so much: 99.9 % of markers with noise
 #: alone are below.
 LARGEST_SHAPE = CHI2_OF_VIEW / 8.0
 #: Part of the variance of independent corners that is left without their mean.
 SHAPE_VISIBLE = 0.75
+#: Most fits of a pose by corners alone, each with less weight for markers that the last one shows as mistaken.
+_REFITS = 4
 #: Fewest markers for the corner bias: the pose absorbs nearly all of the error of fewer.
 FEWEST_MARKERS = 3
 
@@ -52,35 +54,41 @@ class CornerBias:
         All of a single frame's residuals beyond the noise that the corners claim counts as bias, as nothing shows yet
         whether it lasts. Later frames have ``px``.
         """
-        noise = location.sight.noise_px
-        if self._sums.any() or len(noise) < FEWEST_MARKERS:
+        if self._sums.any() or len(location.sight.noise_px) < FEWEST_MARKERS:
             return self.px
-        fitted, squares = _FittedCorners.of(location), (location.reprojection.residuals**2).mean(axis=(1, 2))
-        shown, _ = shown_errors(fitted, fitted, _bounds(squares, INCONSISTENT_PX))
-        claimed = shown.own * float(fitted.shares**2 @ noise**2) / len(noise)
-        return _learned(self.px, shown.smooth_variance(claimed), 1.0)
+        fitted = _FittedCorners.of(location, self.px)
+        bounds = _bounds(_mean_products(fitted.residuals, fitted.residuals), INCONSISTENT_PX)
+        shown, _ = shown_errors(fitted, fitted, bounds)
+        claimed = shown.own * fitted.noise_variance
+        return _learned(self.px, shown.smooth_variance(claimed), self._weight(fitted, shown))
+
+    def _weight(self, fitted: '_FittedCorners', shown: 'ShownErrors') -> float:
+        """What a frame counts beside one of an exact map: the variance of a product is the square of the residuals'."""
+        expected = shown.own * fitted.noise_variance + shown.smooth * self.px**2
+        return (expected / (expected + fitted.map_variance)) ** 2
 
     def add(self, location: Location) -> None:
         """Update with the residuals of a located frame."""
-        before, self._last = self._last, (location, _FittedCorners.of(location))
+        before, self._last = self._last, (location, _FittedCorners.of(location, self.px))
         if before is None or location.pose.stamp_ns <= before[0].pose.stamp_ns:
             return
-        last, noise = before[0], location.sight.noise_px
+        last = before[0]
         places = {key: place for place, key in enumerate(last.pose.marker_ids)}
         now = [place for place, key in enumerate(location.pose.marker_ids) if key in places]
         then = [places[location.pose.marker_ids[place]] for place in now]
         if len(now) < FEWEST_MARKERS:
             return
-        residuals, former = location.reprojection.residuals[now], last.reprojection.residuals[then]
-        products = (residuals * former).sum(axis=(1, 2)) / 8.0
-        of_shape = products - (residuals.mean(axis=1) * former.mean(axis=1)).sum(axis=1) / 2.0
-        of_shape = np.clip(of_shape / (noise[now] * last.sight.noise_px[then]), -LARGEST_SHAPE, LARGEST_SHAPE)
         fitted, former_fitted = self._last[1].only(now), before[1].only(then)
+        residuals, former = fitted.residuals, former_fitted.residuals
+        products = _mean_products(residuals, former)
+        of_shape = products - (residuals.mean(axis=1) * former.mean(axis=1)).sum(axis=1) / 2.0
+        of_shape = np.clip(of_shape / (fitted.noise_px * former_fitted.noise_px), -LARGEST_SHAPE, LARGEST_SHAPE)
         shares = fitted.shares * former_fitted.shares
         # Residuals of moved or mistaken markers are correlated too.
         bounds = _bounds(products, min(INCONSISTENT_PX, BIAS_OUTLIER * self.px))
         shown, common = shown_errors(fitted, former_fitted, bounds)
         known = shown.own * float(shares @ location.sight.observed.detector_px[now] ** 2) / len(now)
+        common *= self._weight(fitted, shown)
         sums = common * np.array((shares.mean(), known, *shown))
         self._sums = BIAS_MEMORY * self._sums + (1.0, of_shape.mean() / SHAPE_VISIBLE, *sums)
         frames, shapes, weight, known, *sums_shown = self._sums.tolist()
@@ -90,9 +98,21 @@ class CornerBias:
         self.shape = min(_learned(prior.marker_shape, shapes / frames, frames), prior.marker_shape)
 
 
-def _bounds(products: FloatArray, largest_px: float) -> FloatArray:
-    """(8 N,) weights of residuals by which no marker's mean product (N,) [px^2] exceeds the square of the largest."""
-    return np.repeat(np.sqrt(np.minimum(1.0, largest_px**2 / np.maximum(np.abs(products), TINY))), 8)
+def _mean_products(residuals: FloatArray, former: FloatArray) -> FloatArray:
+    """Means (N,) [px^2] over the corners of N markers of the products of two residuals (N, 4, 2)."""
+    return np.asarray((residuals * former).sum(axis=(1, 2)) / 8.0)
+
+
+def _bounds(products: FloatArray, largest_px: FloatArray | float) -> FloatArray:
+    """(N,) weights of residuals by which no marker's mean product (N,) [px^2] exceeds the square of the largest."""
+    return np.asarray(np.sqrt(np.minimum(1.0, largest_px**2 / np.maximum(np.abs(products), TINY))))
+
+
+def _refitted(residuals: FloatArray, J: FloatArray, shares: FloatArray) -> FloatArray:
+    """Residuals (N, 4, 2) [px] at the pose that N markers with weights ``shares`` (N,) fit best: J (N, 8, 6)."""
+    weights, J_all = np.repeat(shares, 8), J.reshape(-1, 6)
+    step = np.linalg.lstsq(weights[:, None] * J_all, weights * residuals.ravel(), rcond=None)[0]
+    return np.asarray(residuals - (J_all @ step).reshape(residuals.shape))
 
 
 def _learned(prior: float, variance: float, frames: float) -> float:
@@ -132,27 +152,57 @@ class ShownErrors(NamedTuple):
 class _FittedCorners:
     """Weighted corners of the markers of a frame: what the smooth error is at them, and what the pose takes up."""
 
-    #: (N,) weights of the markers: those with more noise than the frame's median have less
+    #: (N,) weights of the markers: those with more noise than the frame's median have less, and mistaken ones
     shares: FloatArray
-    #: (N, 4, 2) [px], their derivatives (N, 8, 6) by the pose, and (N, 4, I) by the factors of the smooth error
-    residuals: FloatArray
+    #: (N,) standard deviation of a coordinate of their corners [px]
+    noise_px: FloatArray
+    #: (N, 4, 2) [px] as located, and their derivatives (N, 8, 6) by the pose
+    located: FloatArray
     J: FloatArray
+    #: with those weights: (N, 4, I) factors of the smooth error, and (N, 8, K) joint draws of the map's errors in them
     modes_of_markers: FloatArray
+    map_draws: FloatArray
 
     @classmethod
-    def of(cls, location: Location) -> '_FittedCorners':
-        """All markers of a frame."""
+    def of(cls, location: Location, bias_px: float) -> '_FittedCorners':
+        """All markers of a frame; ``bias_px`` is the standard deviation of the bias, as known by then."""
         noise, fit = location.sight.noise_px, location.reprojection
-        shares = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2)
+        by_noise, residuals = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2), fit.residuals
+        for _ in range(_REFITS):
+            bounds = _bounds(_mean_products(residuals, residuals), BIAS_OUTLIER * np.hypot(noise, bias_px))
+            shares = by_noise * bounds
+            residuals = _refitted(fit.residuals, fit.J_camera, shares)
+            if bounds.min() == 1.0:
+                break
         weights = shares[:, None, None]
-        return cls(shares, weights * fit.residuals, weights * fit.J_camera, weights * location.lens.modes)
+        map_draws = weights * (fit.J_marker @ location.sight.draws)
+        return cls(shares, noise, fit.residuals, fit.J_camera, weights * location.lens.modes, map_draws)
 
     def only(self, chosen: list[int]) -> '_FittedCorners':
         """The markers at the places ``chosen``."""
         if chosen == list(range(len(self.shares))):
             return self
-        fields = self.shares, self.residuals, self.J, self.modes_of_markers
+        fields = self.shares, self.noise_px, self.located, self.J, self.modes_of_markers, self.map_draws
         return _FittedCorners(*(field[chosen] for field in fields))
+
+    @cached_property
+    def residuals(self) -> FloatArray:
+        """(N, 4, 2) [px] at the pose that these corners alone fit best.
+
+        The located pose has odometry in it, and weights by the map: what that displaces it is no error of the lens.
+        """
+        return _refitted(self.located, self.J, self.shares)
+
+    @property
+    def noise_variance(self) -> float:
+        """Variance of a weighted corner by its noise [px^2]."""
+        return float(self.shares**2 @ self.noise_px**2) / len(self.shares)
+
+    @property
+    def map_variance(self) -> float:
+        """Variance that the map's errors add to a weighted residual [px^2]."""
+        draws = self.map_draws.reshape(len(self.taken_up), -1)
+        return float(np.mean(np.square(draws - self.taken_up @ (self.taken_up.T @ draws))))
 
     @cached_property
     def modes(self) -> FloatArray:
@@ -161,8 +211,8 @@ class _FittedCorners:
 
     @cached_property
     def taken_up(self) -> FloatArray:
-        """(2 n, 6) orthonormal directions, along which the pose takes up errors."""
-        return np.linalg.qr(self.J.reshape(-1, 6))[0]
+        """(2 n, 6) orthonormal directions, along which the pose takes up weighted errors."""
+        return np.linalg.qr((self.shares[:, None, None] * self.J).reshape(-1, 6))[0]
 
     @cached_property
     def smooth_taken_up(self) -> FloatArray:
@@ -184,14 +234,14 @@ def shown_errors(now: _FittedCorners, former: _FittedCorners, bound: FloatArray)
 
     Parameters
     ----------
-    bound : (2 n,) weights of the residuals of both
+    bound : (N,) further weights of the residuals of both
 
     Returns
     -------
     that, and the share, 0 to 1, of the smooth error in the present residuals that was in the former ones
     """
     n = len(now.modes)
-    r_now, r_former = ((bound * of.residuals.ravel())[:, None] for of in (now, former))
+    r_now, r_former = ((bound * of.shares * of.residuals.T).T.reshape(-1, 1) for of in (now, former))
     common = now.taken_up.T @ former.taken_up
     up_now, up_former = now.smooth_taken_up, former.smooth_taken_up
     both_up = up_now.T @ up_former
