@@ -88,8 +88,12 @@ def test_gravity_settles_the_first_pose_before_a_tilted_marker(seed):
 
 
 @pytest.mark.slow
-def test_a_heading_that_nothing_shows_is_not_flown_on():
-    """As above, but the two poses differ in heading: either no pose, or the right one."""
-    for seed in range(3):
-        _, errors, _ = hover(8.0, seed, heading=np.radians(15.0)).T
+def test_two_poses_that_differ_in_heading_are_followed_until_one_is_left():
+    """As above, but the two poses differ in heading: the wrong one turns with the line of sight."""
+    scores = [hover(8.0, seed, heading=np.radians(30.0)) for seed in range(3)]
+    begun = [flight[0, 0] for flight in scores if len(flight)]
+    # 2.7 to 3.5 s, at most 0.09 m off, NEES 0.1 to 0.2; without a second hypothesis there is no pose.
+    assert len(begun) >= 2
+    for _, errors, nees in (flight.T for flight in scores if len(flight)):
         assert np.all(errors < 1.5)
+        assert np.mean(nees) < 2.0

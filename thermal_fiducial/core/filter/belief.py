@@ -5,14 +5,16 @@ when many poses pass its gate while the estimate refuses them, so that the gate 
 is initialised in the same way, without an estimate to replace. Each pose gets a verdict, which is logged.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 import math
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.pose_noise import PoseNoise
 from thermal_fiducial.core.filter.state import Estimate, POSITION
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
@@ -24,6 +26,8 @@ _PREFERRED = 4
 REFUSALS_OF_DOUBT = 3
 #: Poses that the estimate must accept in a row for the alternative to be dropped.
 _REFUTED = 3
+#: Difference of the costs of two hypotheses that rules out the worse one: odds of e^-10, as in the mapper.
+DECISIVE = 20.0
 NEVER = -(1 << 62)
 #: Verdicts kept, and poses over which the diagnostics average the normalised innovation squared (NIS).
 _KEPT, _NIS_POSES = 300, 30
@@ -77,6 +81,8 @@ class Hypothesis(NamedTuple):
     shown: float = 0.0
     #: of an alternative: poses that it must accept before it may replace the estimate
     needed: int = 0
+    #: minus twice the log likelihood of its poses, up to a constant
+    cost: float = 0.0
 
     def accepting(self, estimate: Estimate) -> 'Hypothesis':
         """The hypothesis after an accepted pose, with the updated ``estimate``."""
@@ -105,6 +111,11 @@ class Hypothesis(NamedTuple):
         """The hypothesis after an accepted pose that would not have shown what the refused ones claim."""
         return self._replace(estimate=estimate, compared_ns=estimate.stamp_ns, shown=shown)
 
+    def with_noise(self, noise: PoseNoise) -> 'Hypothesis':
+        """The hypothesis with variances of the poses' white errors as in ``noise``, not adapted to its own poses."""
+        own = replace(self.estimate.pose_noise, variances=noise.variances, information=noise.information)
+        return self._replace(estimate=replace(self.estimate, pose_noise=own))
+
     @property
     def in_doubt(self) -> bool:
         """Whether the latest poses were refused, ``REFUSALS_OF_DOUBT`` or more in a row."""
@@ -121,6 +132,8 @@ class Belief(NamedTuple):
 
     main: Hypothesis | None = None
     alternative: Hypothesis | None = None
+    #: while initialising with two possible poses: by the other one
+    second: Hypothesis | None = None
     #: on the last pose that was applied
     verdict: PoseUpdate = PoseUpdate(NEVER, False, '', math.nan)
     #: times that an alternative has replaced an estimate
@@ -139,8 +152,8 @@ class Belief(NamedTuple):
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
-        """Main and alternative, as far as they exist."""
-        return [hypothesis for hypothesis in (self.main, self.alternative) if hypothesis]
+        """Main, alternative, and second, as far as they exist."""
+        return [hypothesis for hypothesis in (self.main, self.alternative, self.second) if hypothesis]
 
     @property
     def stamp_ns(self) -> int:
@@ -152,6 +165,11 @@ class Belief(NamedTuple):
         main, other = self.main, self.alternative
         if other is None:
             return self
+        if self.second:
+            likelier, less_likely = sorted((other, self.second), key=attrgetter('cost'))
+            if not likelier.failed and less_likely.cost - likelier.cost <= DECISIVE:
+                return self
+            return self._replace(alternative=likelier, second=None).settled(config)
         if other.failed or (main and main.accepted_in_row >= _REFUTED):
             return self._replace(alternative=None)
         if main is None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseLog, PoseUpdate
+from thermal_fiducial.core.filter.belief import Belief, DECISIVE, Hypothesis, PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.hypotheses import (
     alternative_to,
     contradiction,
@@ -36,6 +36,7 @@ from thermal_fiducial.core.filter.state import (
 )
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
 from thermal_fiducial.core.measurements import CameraPose, Condition
+from thermal_fiducial.core.two_poses import possible_poses, without_turn_to
 from thermal_fiducial.core.types import SECOND_NS
 
 #: A propagated belief is kept at this interval [ns], so that a pose begins there and not at the pose before.
@@ -222,7 +223,7 @@ class History:
         if self.main and belief.main:
             self.main = self._carried(self.main, newest_ns)
             if newest_ns - belief.main.estimate.stamp_ns >= _KEPT_EVERY_NS:
-                self._beliefs.append(belief._replace(main=self.main, alternative=self._alternative()))
+                self._beliefs.append(belief._replace(main=self.main, alternative=self._at_present(belief.alternative)))
         # Half of the buffer at a time: each removal moves the rest.
         if newest_ns - self.imu.oldest_ns > 2 * self._kept_ns:
             self._forget_old()
@@ -256,7 +257,7 @@ class History:
             innovation = self._innovation(main, pose)
             main, verdict = weigh(config, main, innovation, pose.stamp_ns)
             belief = belief._replace(main=main, verdict=verdict)
-            if other is None and not verdict.accepted:
+            if other is None and not verdict.accepted and len(possible_poses(pose)) == 1:
                 belief = self._with_alternative(belief, main, innovation)
         if other:
             innovation = self._innovation(other, pose)
@@ -264,18 +265,28 @@ class History:
             belief = belief._replace(alternative=alternative)
             if main is None and not verdict.accepted:
                 belief = belief._replace(contradiction=contradiction(config, other, innovation))
+            if belief.second:
+                second, _ = weigh(config, belief.second, self._innovation(belief.second, pose), pose.stamp_ns)
+                # Each by itself would adapt to what speaks against it.
+                first, second = (h.with_noise(other.estimate.pose_noise) for h in (alternative, second))
+                belief = belief._replace(alternative=first, second=second, contradiction=TWO_POSES)
         return belief.settled(config)
 
     def _begun(self, belief: Belief, pose: CameraPose) -> Belief:
-        """``belief``, which is empty, with an alternative hypothesis begun from a pose."""
+        """``belief``, which is empty, with an alternative hypothesis begun from a pose, or one from each of two."""
         time_ns = max(self.due_ns(pose, None, belief.first_offset), self.imu.oldest_ns)
         window = self.imu.window(time_ns, WINDOW_SECONDS)
-        begun = first_hypothesis(self.config, pose, time_ns, window, belief.first_offset)
-        if isinstance(begun, Condition):
-            why = 'two poses are possible' if begun is TWO_POSES else 'contradicts gravity'
+        outcomes = [
+            first_hypothesis(self.config, possible, time_ns, window, belief.first_offset)
+            for possible in possible_poses(pose)
+        ]
+        alternative, second, *_ = [h for h in outcomes if isinstance(h, Hypothesis)] + [None, None]
+        if alternative is None:
+            condition = next(outcome for outcome in outcomes if isinstance(outcome, Condition))
+            why = 'two poses are possible' if condition is TWO_POSES else 'contradicts gravity'
             refused = PoseUpdate(pose.stamp_ns, False, f'refused: {why}', math.nan)
-            return belief._replace(contradiction=begun, verdict=refused)
-        return belief._replace(alternative=begun).settled(self.config)
+            return belief._replace(contradiction=condition, verdict=refused)
+        return belief._replace(alternative=alternative, second=second).settled(self.config)
 
     def _with_alternative(self, belief: Belief, main: Hypothesis, refused: Innovation) -> Belief:
         """``belief`` with an alternative hypothesis begun from a pose that its ``main`` one has just refused."""
@@ -317,8 +328,17 @@ class History:
                 derivative = estimate.state.derivative(self.imu.at(estimate.stamp_ns))
                 estimate = estimate.widened(embedded_core(derivative), std)
         motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)
-        measured = body_pose(pose, estimate.state.T_body_camera, self.config.pose_noise_scale)
-        return innovation_of(self.config, estimate, measured, motion)
+
+        def of(measured: CameraPose) -> Innovation:
+            by_body = body_pose(measured, estimate.state.T_body_camera, self.config.pose_noise_scale)
+            return innovation_of(self.config, estimate, by_body, motion)
+
+        possible = possible_poses(pose)
+        nearer, *farther = sorted(map(of, possible), key=attrgetter('nis'))
+        if farther and farther[0].nis - nearer.nis < DECISIVE:
+            # The estimate does not show which of the two it is: then nothing is known of the turn between them.
+            return of(without_turn_to(possible[0].T_map_camera, pose))
+        return nearer
 
     def _carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
         """A hypothesis propagated along the samples to an instant that is not later than the newest sample."""
@@ -336,9 +356,8 @@ class History:
         steps = self.imu.steps(estimate.stamp_ns, until_ns)
         return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self.walks))
 
-    def _alternative(self) -> Hypothesis | None:
-        """The alternative hypothesis at the newest sample."""
-        other = self.belief.alternative
+    def _at_present(self, other: Hypothesis | None) -> Hypothesis | None:
+        """A hypothesis, if there is one, at the newest sample."""
         return other and self._carried(other, self.imu.newest_ns)
 
     def _forget_old(self) -> None:
@@ -346,7 +365,9 @@ class History:
         horizon_ns = self.imu.newest_ns - self._kept_ns
         if self.belief.stamp_ns < horizon_ns and self.belief.main is None:
             # Initialising, and no pose for that long: only the hypothesis carried to the present is needed.
-            self._beliefs = [self.belief._replace(alternative=self._alternative())]
+            belief = self.belief
+            second = self._at_present(belief.second)
+            self._beliefs = [belief._replace(alternative=self._at_present(belief.alternative), second=second)]
         while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
             del self._beliefs[0]
         oldest = self._beliefs[0]

@@ -7,7 +7,7 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Hypothesis, PoseUpdate
-from thermal_fiducial.core.filter.initialization import blank_state, start
+from thermal_fiducial.core.filter.initialization import blank_state, cost_of_vertical, start
 from thermal_fiducial.core.filter.state import POSE, TIME_OFFSET
 from thermal_fiducial.core.filter.update import (
     adapted_noise,
@@ -41,6 +41,7 @@ def weigh(
     so vague that it agrees with an estimate which is metres off.
     """
     estimate, nis = innovation.estimate, innovation.nis
+    hypothesis = hypothesis._replace(cost=hypothesis.cost + min(nis, config.gate))
     coasted = (estimate.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
     stale = coasted > config.reinitialise_after
     if nis <= config.gate and not stale:
@@ -96,7 +97,9 @@ def first_hypothesis(
     blank = replace(blank_state(config), time_offset=time_offset)
     measured = body_pose(pose, blank.T_body_camera, config.pose_noise_scale)
     estimate = start(config, measured, time_ns, blank, window)
-    return estimate if isinstance(estimate, Condition) else Hypothesis(estimate, time_ns, time_ns, time_ns)
+    if isinstance(estimate, Condition):
+        return estimate
+    return Hypothesis(estimate, time_ns, time_ns, time_ns, cost=cost_of_vertical(measured, window))
 
 
 def relinearises(begun: Hypothesis, first_offset: float) -> bool:

@@ -27,15 +27,9 @@ from thermal_fiducial.core.filter.state import (
     SYSTEMATIC,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry.se3 import (
-    camera_in_body,
-    skew,
-    so3_exp,
-    so3_left_jacobian,
-    transform,
-)
+from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.measurements import Condition, VAGUE
-from thermal_fiducial.core.types import FloatArray, TINY
+from thermal_fiducial.core.types import FloatArray
 
 #: Window [s] of the samples that a first pose is compared with.
 WINDOW_SECONDS = 0.5
@@ -46,8 +40,6 @@ HARDLY_GRAVITY = 0.5
 LARGEST_TILT = math.radians(35.0)
 #: Standard deviation of the vertical by the mean of half a second of samples [rad]: the robot accelerates by 1 m/s^2.
 _VERTICAL_STD = 0.1
-#: Gauss-Newton steps, as two poses may be 60 degrees apart.
-_STEPS = 5
 #: Why nothing begins with a vague pose.
 TWO_POSES = Condition('two poses are possible', 'gravity does not show which one; move, or show another marker')
 
@@ -79,10 +71,8 @@ def start(
     prior : state that gives biases, scale errors, gravity, clock offset and extrinsics
     imu : (N, 6) samples up to the pose's instant, the last one at that instant
     """
-    settled = settled_by_gravity(pose, imu)
-    if settled is None:
+    if math.sqrt(pose.covariance[:3, :3].trace()) > VAGUE:
         return TWO_POSES
-    pose = settled
     if (contradiction := _contradiction_of_gravity(pose, imu, config.gravity)) is not None:
         return contradiction
     noise = PoseNoise.of(pose, config.stamp_jitter, config.mount_vibration)
@@ -108,31 +98,11 @@ def start(
     return Estimate(stamp_ns, state, P, pose_noise=noise)
 
 
-def settled_by_gravity(pose: BodyPose, imu: FloatArray) -> BodyPose | None:
-    """A first pose, if its attitude is vague with the vertical by the samples; None if it stays vague.
-
-    Before one small marker two poses are possible, and the covariance has both. Where they differ in tilt, the vertical
-    shows which it is; where they differ in heading, it does not.
-
-    Parameters
-    ----------
-    imu : (N, 6) samples up to the pose's instant
-    """
-    if math.sqrt(pose.covariance[:3, :3].trace()) <= VAGUE:
-        return pose
-    force = imu.mean(axis=0)[3:]
-    direction = force / max(float(np.linalg.norm(force)), TINY)
-    P, T, error, H = pose.covariance, pose.T_map_body, np.zeros(6), np.zeros((3, 6))
-    for _ in range(_STEPS):
-        up = T[2, :3]
-        H[:, :3] = skew(up)
-        gain = P @ H.T @ np.linalg.inv(H @ P @ H.T + _VERTICAL_STD**2 * np.eye(3))
-        error = gain @ (direction - up + H @ error)
-        turn = error[:3]
-        T = pose.T_map_body @ transform(so3_exp(turn), so3_left_jacobian(turn) @ error[3:])
-    P = (np.eye(6) - gain @ H) @ P
-    known = math.sqrt(P[:3, :3].trace()) <= VAGUE
-    return replace(pose, T_map_body=T, covariance=0.5 * (P + P.T)) if known else None
+def cost_of_vertical(pose: BodyPose, imu: FloatArray) -> float:
+    """Chi square of the angle between a pose's vertical and the mean specific force of samples (N, 6)."""
+    up, force = pose.T_map_body[2, :3], imu.mean(axis=0)[3:]
+    tilt = math.atan2(float(np.linalg.norm(np.cross(up, force))), float(up @ force))
+    return (tilt / _VERTICAL_STD) ** 2
 
 
 def _contradiction_of_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -> Condition | None:

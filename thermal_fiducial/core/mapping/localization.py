@@ -18,6 +18,7 @@ from thermal_fiducial.core.mapping.joint_fit import Alternative, DECISIVE, Joint
 from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
+from thermal_fiducial.core.two_poses import mean_of_two
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.core.wording import marker_names
 
@@ -133,8 +134,8 @@ def _with_spread(found: Location, spread: FloatArray) -> Location:
 def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPose | None) -> Location | Refusal:
     """The likelier of two poses that the corners allow by the last frame, with the other one.
 
-    Without a last frame the map learns nothing from it, and the pose says nothing of the turn between the two: the
-    filter has gravity.
+    Without a last frame the map learns nothing from it, and the pose is the mean of both: the filter, which has gravity
+    and follows both over time, finds the two in it.
     """
     T = other.T_map_camera
     second = frame.refined(T, frame.sight.reprojected(frame.camera, T), found.weights)
@@ -150,9 +151,22 @@ def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPo
     chi2 = frame.fit.costs(np.stack([found.pose.T_map_camera, second.pose.T_map_camera]))
     chi2 *= decision_weights(frame.sight.noise_px, frame.model).min()
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
-    likelier, less_likely = (found, second) if chi2[0] <= chi2[1] else (second, found)
-    pose = _without_turn_to(less_likely.pose.T_map_camera, _with_other(likelier, less_likely.pose, 0.0)).pose
-    return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both, pose=pose)
+    return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both, pose=_mean(found, second))
+
+
+def _mean(found: Location, second: Location) -> CameraPose:
+    """The pose halfway along the screw from one of two possible poses to the other, with both in its covariance.
+
+    Errors across the line of sight have opposite signs in the two, so the mean of both covariances has none of their
+    correlations with the others. That of the second is scaled to the first: its residuals have more than noise.
+    """
+    T_first, T_second = found.pose.T_map_camera, second.pose.T_map_camera
+    mean = found.moved(0.5 * screw_difference(T_second, T_first), np.zeros((6, 6))).pose
+    other = second.moved(screw_difference(mean.T_map_camera, T_second), np.zeros((6, 6))).pose
+    scale = (found.rotation_std / second.rotation_std) ** 2
+    own = 0.5 * (mean.covariance - mean.map_covariance + scale * (other.covariance - other.map_covariance))
+    at_own = replace(mean, covariance=own + mean.map_covariance)
+    return mean_of_two(at_own, screw_difference(T_second, mean.T_map_camera))
 
 
 def _cost_of_turn(pose: CameraPose, last: CameraPose) -> float:

@@ -1,50 +1,110 @@
-"""What a first pose needs: an attitude that is known, by itself or with the vertical."""
+"""A first pose that may be one of two: found in their mean, by gravity, and by how each goes on."""
+
+import math
 
 import numpy as np
 import pytest
-from support.flights import GRAVITY
+from support.flights import config, GRAVITY, START_NS, T_BODY_CAMERA
 
-from thermal_fiducial.core.filter.initialization import settled_by_gravity
-from thermal_fiducial.core.filter.pose_noise import BodyPose
-from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, so3_exp, so3_left_jacobian, transform
-from thermal_fiducial.core.measurements import NOTHING_KNOWN, VAGUE
+from thermal_fiducial.core.error_model import covariance_of_one_error
+from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.filter.initialization import TWO_POSES
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, screw_difference
+from thermal_fiducial.core.geometry.se3 import rotation_angle, so3_exp, transform
+from thermal_fiducial.core.measurements import CameraPose, ImuSample, NOTHING_KNOWN
+from thermal_fiducial.core.two_poses import mean_of_two, possible_poses
 
-
-def screw(axis, angle):
-    """(6,) turn by an angle about an axis, in the robot frame, through a marker 8 m ahead: rotation and position."""
-    turn = angle * np.asarray(axis) / np.linalg.norm(axis)
-    return np.concatenate((turn, np.cross([8.0, 0.0, 0.0], turn)))
-
-
-def two_poses(axis, angle):
-    """A pose that says nothing of the turn to the other one, and the other one, which is right."""
-    T = transform(so3_exp([0.02, -0.03, 0.7]), [1.0, 2.0, 3.0])
-    d = screw(axis, angle)
-    truth = T @ transform(so3_exp(d[:3]), so3_left_jacobian(d[:3]) @ d[3:])
-    known, unknown = np.diag(np.repeat((0.01, 0.02), 3) ** 2), screw(axis, NOTHING_KNOWN)
-    return BodyPose(T, known + np.outer(unknown, unknown)), truth
+MARKER = np.array([8.0, 0.5, 1.0])
+LEVEL = transform(so3_exp([0.0, 0.0, 0.1]), [0.0, 0.0, 1.0])
+UPRIGHT, AHEAD = [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]
 
 
-def samples(T_map_body):
-    """Half a second at rest."""
-    return np.tile(np.concatenate((np.zeros(3), GRAVITY * T_map_body[2, :3])), (100, 1))
+def about_marker(axis, angle):
+    """(4, 4) motion of the map: a turn by an angle [rad] about an axis through the marker."""
+    R = so3_exp(angle * np.asarray(axis))
+    return transform(R, MARKER - R @ MARKER)
 
 
-@pytest.mark.parametrize('angle', [-0.9, -0.3, 0.3, 0.9])
-def test_gravity_settles_which_of_two_poses_that_differ_in_tilt(angle):
-    pose, truth = two_poses([0.0, 1.0, 0.3], angle)
-    settled = settled_by_gravity(pose, samples(truth))
-    # The vertical is exact here; what else the pose is known to, 0.01 rad and 0.02 m, may give way by a share.
-    assert rotation_angle(settled.T_map_body[:3, :3].T @ truth[:3, :3]) < 0.03
-    assert np.linalg.norm(inverse(settled.T_map_body)[:3, 3] - inverse(truth)[:3, 3]) < 0.2
-    assert np.sqrt(settled.covariance[:3, :3].trace()) < VAGUE
+def either(stamp_ns, T_map_body, axis, angle):
+    """What the mapper publishes where the pose turned about the marker is possible, too: corners know each to 1 deg."""
+    T = about_marker(axis, 0.5 * angle) @ T_map_body @ T_BODY_CAMERA
+    half = screw_difference(T_map_body @ T_BODY_CAMERA, T)
+    at_marker = np.diag(np.repeat((0.003, 0.02), 3) ** 2)
+    to_camera = lever_arm(T[:3, 3] - MARKER)
+    of_map = lever_arm(T[:3, 3]) @ np.diag(np.repeat((1e-3, 1e-4), 3) ** 2) @ lever_arm(T[:3, 3]).T
+    own = to_camera @ at_marker @ to_camera.T
+    return mean_of_two(CameraPose(stamp_ns, T, own + of_map, of_map), half)
 
 
-def test_gravity_does_not_settle_which_of_two_poses_that_differ_in_heading():
-    pose, truth = two_poses([0.0, 0.0, 1.0], 0.6)
-    assert settled_by_gravity(pose, samples(truth)) is None
+def flown(axis, angle, speed=0.0, seconds=1.5):
+    """A filter after a level flight to the left, from rest to ``speed`` [m/s] in a second, and the pose at its end.
+
+    The pose that is possible, too, is mirrored at the line of sight: as that turns, it turns by twice as much.
+    """
+    ekf, T = PoseEkf(config()), LEVEL.copy()
+    for k in range(round(100 * seconds)):
+        t, stamp_ns = k / 100.0, START_NS + 10_000_000 * k
+        ekf.add_imu(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, speed * (t < 1.0), GRAVITY])))
+        if k % 4 == 3:
+            T[:3, 3] = LEVEL[:3, 3] + speed * (0.5 * t**2 if t < 1.0 else t - 0.5) * LEVEL[:3, 1]
+            (x, y), (x_first, y_first) = T[:2, 3] - MARKER[:2], LEVEL[:2, 3] - MARKER[:2]
+            turned = math.atan2(y, x) % math.tau - math.atan2(y_first, x_first) % math.tau
+            ekf.add_pose(either(stamp_ns, T, axis, angle - 2.0 * turned))
+    return ekf, T
 
 
-def test_a_pose_that_is_known_needs_no_gravity():
-    pose = BodyPose(np.eye(4), 1e-4 * np.eye(6))
-    assert settled_by_gravity(pose, samples(transform(so3_exp([0.1, 0.0, 0.0]), np.zeros(3)))) is pose
+def off_by(ekf, T_map_body):
+    """Angle [rad] between the filter's attitude and the true one."""
+    return float(rotation_angle(ekf.state.R_map_body.T @ T_map_body[:3, :3]))
+
+
+@pytest.mark.parametrize('angle', [-1.2, 0.5, 1.2])
+def test_two_poses_are_found_in_their_mean(angle):
+    pose = either(0, LEVEL, UPRIGHT, angle)
+    right, other = LEVEL @ T_BODY_CAMERA, about_marker(UPRIGHT, angle) @ LEVEL @ T_BODY_CAMERA
+    found = possible_poses(pose)
+    assert len(found) == 2
+    for T in (right, other):
+        nearest = min(found, key=lambda each: rotation_angle(each.T_map_camera[:3, :3].T @ T[:3, :3]))
+        # What each is uncertain by along the turn is added to its square: 0.02 rad to 0.25 at the least.
+        assert np.abs(difference(nearest.T_map_camera, T)).max() < 0.02
+        relative = nearest.covariance - nearest.map_covariance
+        assert np.sqrt(np.diag(relative)[3:]) == pytest.approx([0.02] * 3, rel=0.05)
+        assert np.linalg.eigvalsh(relative).min() > 0.0
+
+
+def test_a_pose_that_is_known_and_one_that_does_not_show_a_turn_are_one():
+    known = CameraPose(0, LEVEL, 1e-4 * np.eye(6))
+    turn = np.array([0.0, 8.0, 0.0, 0.0, 0.0, 1.0])
+    unknown = CameraPose(0, LEVEL, 1e-4 * np.eye(6) + covariance_of_one_error(turn, NOTHING_KNOWN))
+    assert possible_poses(known) == [known]
+    assert possible_poses(unknown) == [unknown]
+
+
+def test_a_pose_that_is_uncertain_about_two_axes_is_no_mean_of_two_and_begins_nothing():
+    uncertain = CameraPose(START_NS + 20_000_000, LEVEL @ T_BODY_CAMERA, np.diag([0.01, 0.01, 0.01, 0.05, 0.05, 1e-4]))
+    assert possible_poses(uncertain) == [uncertain]
+    ekf = PoseEkf(config())
+    for k in range(3):
+        ekf.add_imu(ImuSample(START_NS + 10_000_000 * k, np.zeros(3), np.array([0.0, 0.0, GRAVITY])))
+    assert ekf.add_pose(uncertain).reason == 'refused: two poses are possible'
+
+
+@pytest.mark.parametrize('angle', [-1.2, 0.5])
+def test_gravity_shows_which_of_two_poses_that_differ_in_tilt(angle):
+    ekf, T = flown(AHEAD, angle, seconds=0.5)
+    # Exact poses and samples; their biases are not known yet.
+    assert off_by(ekf, T) < 0.02
+
+
+def test_two_poses_that_differ_in_heading_wait_at_rest():
+    ekf, _ = flown(UPRIGHT, 0.8)
+    assert ekf.state is None
+    assert ekf.condition == TWO_POSES
+
+
+@pytest.mark.parametrize('angle', [-0.8, 0.5])
+def test_motion_around_the_marker_shows_which_heading_is_right(angle):
+    """By how the two go on: the wrong one turns with the line of sight."""
+    ekf, T = flown(UPRIGHT, angle, speed=1.0)
+    assert off_by(ekf, T) < 0.02

@@ -15,6 +15,7 @@ from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import CameraPose, CORNER_FIELDS, Observations
+from thermal_fiducial.core.two_poses import possible_poses
 
 MODEL = SystematicErrors()
 
@@ -103,6 +104,33 @@ def test_odometry_settles_the_ambiguity_of_a_far_marker():
         # Two standard deviations of the odometry, whose attitude the corners can hardly improve.
         assert rotation_angle(there[:3, :3].T @ fused.T_map_camera[:3, :3]) < 0.04
         assert rotation_angle(other[:3, :3].T @ fused.T_map_camera[:3, :3]) > 0.1
+
+
+def test_the_pose_of_an_unsettled_frame_is_the_mean_of_both():
+    rng = np.random.default_rng(2)
+    poses, T = look_at_one(rng, [-8.0, 4.0, 0.0])
+    unsettled = located(T, poses, see(T, poses, 0.1, rng))
+    found = possible_poses(unsettled.pose)
+    assert len(found) == 2
+    for there in unsettled.viewpoint.T_map_camera:
+        nearest = min(found, key=lambda each: rotation_angle(each.T_map_camera[:3, :3].T @ there[:3, :3]))
+        # 53 degrees apart; each known to less than one, which adds less than a thousandth to the turn.
+        assert rotation_angle(nearest.T_map_camera[:3, :3].T @ there[:3, :3]) < np.radians(0.1)
+        assert np.linalg.norm(nearest.T_map_camera[:3, 3] - there[:3, 3]) < 0.02
+
+
+def test_of_two_poses_that_are_not_apart_the_mean_claims_what_it_is_worth():
+    """From the front: neither by how much nor about which axis the marker is turned."""
+    nees = []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        poses, T = look_at_one(rng, [-8.0, 0.3, 0.0])
+        outcome = located(T, poses, see(T, poses, 0.1, rng))
+        if isinstance(outcome, Refusal) and len(possible_poses(outcome.pose)) == 1:
+            nees.append(nees_of(T, outcome.pose))
+    assert len(nees) > 50
+    # 0.4; by the fits to the corners alone, without one another, more than 10.
+    assert np.mean(nees) < 1.0
 
 
 def test_odometry_counts_by_what_it_is_worth():

@@ -1,0 +1,74 @@
+"""Two poses of a camera that are both possible, in one message: their mean, whose covariance has both.
+
+A square that is small in the image has two poses that explain its corners (the planar ambiguity). The mapper publishes
+the mean where nothing that it has shows which one is right, and the filter finds the two in it.
+"""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+
+from thermal_fiducial.core.error_model import covariance_of_one_error
+from thermal_fiducial.core.geometry.reprojection import lever_arm, screw_difference, screwed, turned
+from thermal_fiducial.core.geometry.se3 import so3_exp
+from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
+from thermal_fiducial.core.types import FloatArray
+
+#: Two poses are apart if half of the turn between them is as many standard deviations of each; else they are one, which
+#: is uncertain. Published with a tenth more, for the rounding of the covariance.
+APART = 3.0
+_CLEARLY_APART = 1.1 * APART
+#: Largest half of a turn between two poses [rad]. Where a pose says nothing of a turn, it claims more.
+_LARGEST_HALF = math.pi / 2.0
+
+
+def mean_of_two(mean: CameraPose, half: FloatArray) -> CameraPose:
+    """The ``mean`` of two poses, at the covariance that each has there, with both in its covariance.
+
+    Parameters
+    ----------
+    half : (6,) screw from the mean to one of the two, in the map [m, rad]; the other one is as far on the other side
+    """
+    spread, turn = covariance_of_one_error(half), half[3:]
+    squared = float(turn @ turn)
+    own = float(turn @ (mean.covariance - mean.map_covariance)[3:, 3:] @ turn) / squared
+    if squared < max(VAGUE**2, _CLEARLY_APART**2 * own):
+        # From the front the corners do not show about which axis across the line of sight it is turned, either.
+        to_axis = np.cross(turn, half[:3]) / squared
+        across = np.cross(turn, to_axis) / np.linalg.norm(to_axis)
+        spread += covariance_of_one_error(np.concatenate([np.cross(to_axis, across), across]))
+    return replace(mean, covariance=mean.covariance + spread)
+
+
+def possible_poses(pose: CameraPose) -> list[CameraPose]:
+    """The pose, or the two that it is the mean of if these are apart.
+
+    Along the turn from the one to the other the covariance of the mean has the square of its half. What each is
+    uncertain by there is not in it apart; it is about as much as about the axis across, as the outline of a square
+    changes alike with both.
+    """
+    own = pose.covariance - pose.map_covariance
+    if own[3:, 3:].trace() <= VAGUE**2:
+        return [pose]
+    variances, axes = np.linalg.eigh(own[3:, 3:])
+    if not APART**2 * variances[1] < variances[2] < _LARGEST_HALF**2:
+        return [pose]
+    half = own[:, 3:] @ axes[:, 2] / variances[2] * math.sqrt(variances[2] - variances[1])
+    own -= covariance_of_one_error(half)
+    poses = []
+    for step in (half, -half):
+        T = screwed(pose.T_map_camera, step)
+        # Errors of the corners stay what they are in the camera, those of the map what they are in the map.
+        with_map = lever_arm(T[:3, 3] - pose.T_map_camera[:3, 3])
+        of_map = with_map @ pose.map_covariance @ with_map.T
+        covariance = turned(own, so3_exp(step[3:])) + of_map
+        poses.append(replace(pose, T_map_camera=T, covariance=covariance, map_covariance=of_map))
+    return poses
+
+
+def without_turn_to(T_other: FloatArray, pose: CameraPose) -> CameraPose:
+    """A pose that says nothing of the turn from it to another one (4, 4)."""
+    apart = screw_difference(T_other, pose.T_map_camera)
+    unknown = covariance_of_one_error(apart, NOTHING_KNOWN / float(np.linalg.norm(apart[3:])))
+    return replace(pose, covariance=pose.covariance + unknown)
