@@ -46,7 +46,8 @@ def possible_poses(pose: CameraPose) -> list[CameraPose]:
 
     Along the turn from the one to the other the covariance of the mean has the square of its half. What each is
     uncertain by there is not in it apart; it is about as much as about the axis across, as the outline of a square
-    changes alike with both.
+    changes alike with both. The camera moves about the marker as it turns: a pose whose position does not go with the
+    turn, of a robot that does not know its heading say, is one that is uncertain.
     """
     own = pose.covariance - pose.map_covariance
     if own[3:, 3:].trace() <= VAGUE**2:
@@ -55,6 +56,9 @@ def possible_poses(pose: CameraPose) -> list[CameraPose]:
     if not APART**2 * variances[1] < variances[2] < _LARGEST_HALF**2:
         return [pose]
     half = own[:, 3:] @ axes[:, 2] / variances[2] * math.sqrt(variances[2] - variances[1])
+    moved = half[:3]
+    if moved @ own[:3, :3] @ moved * (1.0 - 1.0 / APART**2) >= (moved @ moved) ** 2:
+        return [pose]
     own -= covariance_of_one_error(half)
     poses = []
     for step in (half, -half):

@@ -90,6 +90,13 @@ def test_a_pose_that_is_uncertain_about_two_axes_is_no_mean_of_two_and_begins_no
     assert ekf.add_pose(uncertain).reason == 'refused: two poses are possible'
 
 
+@pytest.mark.parametrize('heading_std', [0.3, 0.8])
+def test_a_pose_that_does_not_know_its_heading_is_no_mean_of_two(heading_std):
+    """Of somebody else: its place does not go with its turn."""
+    vague = CameraPose(0, LEVEL @ T_BODY_CAMERA, np.diag([0.01, 0.01, 0.01, 1e-4, 1e-4, heading_std**2]))
+    assert possible_poses(vague) == [vague]
+
+
 @pytest.mark.parametrize('angle', [-1.2, 0.5])
 def test_gravity_shows_which_of_two_poses_that_differ_in_tilt(angle):
     ekf, T = flown(AHEAD, angle, seconds=0.5)
@@ -105,6 +112,6 @@ def test_two_poses_that_differ_in_heading_wait_at_rest():
 
 @pytest.mark.parametrize('angle', [-0.8, 0.5])
 def test_motion_around_the_marker_shows_which_heading_is_right(angle):
-    """By how the two go on: the wrong one turns with the line of sight."""
-    ekf, T = flown(UPRIGHT, angle, speed=1.0)
+    """By how the two go on: the wrong one turns with the line of sight. At first, a bias of the gyroscope does, too."""
+    ekf, T = flown(UPRIGHT, angle, speed=1.0, seconds=2.0)
     assert off_by(ekf, T) < 0.02
