@@ -278,6 +278,12 @@ class PoseEkf:
         return condition_of(self._history, self._config)
 
     @property
+    def doubt_of_mount(self) -> Condition | None:
+        """That the camera is turned on the robot by more than is claimed."""
+        main = self._history.main
+        return main.estimate.mount.contradiction(self._config.extrinsics_orientation_std) if main else None
+
+    @property
     def status(self) -> str:
         """The condition as text."""
         return str(self.condition)

@@ -101,7 +101,7 @@ def propagated(estimate: Estimate, steps: Steps, stamp_ns: int, walks: FloatArra
         P[CORE, CORE] = cross[:, MOVED_BY] @ transition.T + noise
         diagonal += walks * dt
     moved = replace(state, R_map_body=R_map_body[-1], velocity=velocity, position=position)
-    return Estimate(stamp_ns, moved, P, estimate.pose_noise)
+    return replace(estimate, stamp_ns=stamp_ns, state=moved, covariance=P)
 
 
 def _moved(

@@ -9,11 +9,12 @@ M. Brossard, A. Barrau, P. Chauchat, S. Bonnabel, "Associating Uncertainty to Ex
 Preintegration", IEEE T-RO 2022.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
 
+from thermal_fiducial.core.filter.mount import MountEvidence
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
 from thermal_fiducial.core.geometry.reprojection import lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_left_jacobian, transform
@@ -142,6 +143,7 @@ class Estimate:
     covariance: FloatArray
     #: noise of the camera poses, as adapted to the innovations
     pose_noise: PoseNoise
+    mount: MountEvidence = field(default_factory=MountEvidence)
 
     def widened(self, error: FloatArray, std: float) -> 'Estimate':
         """The estimate with an unknown multiple of an ``error`` (54,), of standard deviation ``std``."""

@@ -165,7 +165,9 @@ def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
         state = state.moved((before - now) * error[TIME_OFFSET])
         covariance = _in_clock_of_imu(config, covariance, now, innovation)
     noise = replace(adapted_noise(innovation), last=innovation.pose.after(prior.pose_noise.last, state.T_map_body))
-    return replace(prior, state=state, covariance=covariance, pose_noise=noise)
+    by_rotation = innovation.H @ innovation.of_extrinsics[:, :3]
+    mount = prior.mount.after(by_rotation, innovation.S_exact, innovation.value)
+    return replace(prior, state=state, covariance=covariance, pose_noise=noise, mount=mount)
 
 
 def adapted_noise(innovation: Innovation) -> PoseNoise:
