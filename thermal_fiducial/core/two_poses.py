@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.error_model import covariance_of_one_error
-from thermal_fiducial.core.geometry.reprojection import lever_arm, screw_difference, screwed, turned
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, screw_difference, screwed, turned
 from thermal_fiducial.core.geometry.se3 import so3_exp
 from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
 from thermal_fiducial.core.types import FloatArray
@@ -30,14 +30,19 @@ def mean_of_two(mean: CameraPose, half: FloatArray) -> CameraPose:
     ----------
     half : (6,) screw from the mean to one of the two, in the map [m, rad]; the other one is as far on the other side
     """
-    spread, turn = covariance_of_one_error(half), half[3:]
+    turn = half[3:]
     squared = float(turn @ turn)
     own = float(turn @ (mean.covariance - mean.map_covariance)[3:, 3:] @ turn) / squared
     if squared < max(VAGUE**2, _CLEARLY_APART**2 * own):
-        # From the front the corners do not show about which axis across the line of sight it is turned, either.
+        # From the front the corners do not show about which axis across the line of sight the marker is turned.
         to_axis = np.cross(turn, half[:3]) / squared
         across = np.cross(turn, to_axis) / np.linalg.norm(to_axis)
-        spread += covariance_of_one_error(np.concatenate([np.cross(to_axis, across), across]))
+        turns = half, np.concatenate([np.cross(to_axis, across), across])
+        unknown = (covariance_of_one_error(each, NOTHING_KNOWN / math.sqrt(squared)) for each in turns)
+        return replace(mean, covariance=mean.covariance + sum(unknown))
+    T = mean.T_map_camera
+    ends = (difference(screwed(T, step), T) for step in (half, -half))
+    spread = 0.5 * sum(map(covariance_of_one_error, ends))
     return replace(mean, covariance=mean.covariance + spread)
 
 
@@ -46,8 +51,9 @@ def possible_poses(pose: CameraPose) -> list[CameraPose]:
 
     Along the turn from the one to the other the covariance of the mean has the square of its half. What each is
     uncertain by there is not in it apart; it is about as much as about the axis across, as the outline of a square
-    changes alike with both. The camera moves about the marker as it turns: a pose whose position does not go with the
-    turn, of a robot that does not know its heading say, is one that is uncertain.
+    changes alike with both. Of the distance to the marker they claim as little as the mean. The camera moves about the
+    marker as it turns: a pose whose position does not go with the turn, of a robot that does not know its heading say,
+    is one that is uncertain.
     """
     own = pose.covariance - pose.map_covariance
     if own[3:, 3:].trace() <= VAGUE**2:
@@ -60,6 +66,8 @@ def possible_poses(pose: CameraPose) -> list[CameraPose]:
     if moved @ own[:3, :3] @ moved * (1.0 - 1.0 / APART**2) >= (moved @ moved) ** 2:
         return [pose]
     own -= covariance_of_one_error(half)
+    # The camera moves along an arc about the marker, whose chord the covariance has.
+    half[:3] /= np.sinc(np.linalg.norm(half[3:]) / np.pi)
     poses = []
     for step in (half, -half):
         T = screwed(pose.T_map_camera, step)

@@ -160,12 +160,11 @@ def _mean(found: Location, second: Location) -> CameraPose:
     Errors across the line of sight have opposite signs in the two, so the mean of both covariances has none of their
     correlations with the others. That of the second is scaled to the first: its residuals have more than noise.
     """
-    T_first, T_second = found.pose.T_map_camera, second.pose.T_map_camera
-    mean = found.moved(0.5 * screw_difference(T_second, T_first), np.zeros((6, 6))).pose
-    other = second.moved(screw_difference(mean.T_map_camera, T_second), np.zeros((6, 6))).pose
+    T_second = second.pose.T_map_camera
+    mean = found.moved(0.5 * screw_difference(T_second, found.pose.T_map_camera), np.zeros((6, 6))).pose
     scale = (found.rotation_std / second.rotation_std) ** 2
-    own = 0.5 * (mean.covariance - mean.map_covariance + scale * (other.covariance - other.map_covariance))
-    at_own = replace(mean, covariance=own + mean.map_covariance)
+    first, other = (pose.covariance - pose.map_covariance for pose in (found.pose, second.pose))
+    at_own = replace(mean, covariance=0.5 * (first + scale * other) + mean.map_covariance)
     return mean_of_two(at_own, screw_difference(T_second, mean.T_map_camera))
 
 

@@ -73,6 +73,16 @@ def test_two_poses_are_found_in_their_mean(angle):
         assert np.linalg.eigvalsh(relative).min() > 0.0
 
 
+@pytest.mark.parametrize('angle', [-1.6, 0.5, 1.2])
+def test_each_of_two_poses_is_within_the_claim_of_their_mean(angle):
+    """The two are on an arc about the marker, 8 m away: tangents of it at the mean pass them by a metre."""
+    pose = either(0, LEVEL, UPRIGHT, angle)
+    for T in (LEVEL @ T_BODY_CAMERA, about_marker(UPRIGHT, angle) @ LEVEL @ T_BODY_CAMERA):
+        error = difference(T, pose.T_map_camera)
+        # One standard deviation across the line of sight, and one along it.
+        assert error @ np.linalg.solve(pose.covariance, error) < 2.0
+
+
 def test_a_pose_that_is_known_and_one_that_does_not_show_a_turn_are_one():
     known = CameraPose(0, LEVEL, 1e-4 * np.eye(6))
     turn = np.array([0.0, 8.0, 0.0, 0.0, 0.0, 1.0])
