@@ -24,3 +24,15 @@ def test_a_start_allows_for_the_bias_of_the_gyroscope():
     error, covariance = run.published.errors(judged), run.published.covariance
     squares = np.einsum('ni,nij,nj->n', error[:, 3:], np.linalg.inv(covariance[:, 3:, 3:]), error[:, 3:])
     assert squares.max() < chi2.ppf(0.9973, 3)
+
+
+def test_first_poses_allow_for_a_poor_lens():
+    """Thirteen starts; the lens is off by 0.4 to 1 px."""
+    squares = []
+    for begin in np.arange(0.5, 39.0, 3.1):
+        run, judged = started(begin, 0.3)
+        error, covariance = run.markers.errors(judged)[:2], run.markers.covariance[:2]
+        squares.append(np.einsum('ni,nij,nj->n', error, np.linalg.inv(covariance), error))
+    # Of the first two poses; 1.0 when written, 2.6 with a bias of 0.1 px. Asked of claims is 0.5 to 2.
+    assert 0.5 < np.mean(squares) / 6.0 < 2.0
+    assert np.max(squares) < chi2.ppf(0.9973, 6)

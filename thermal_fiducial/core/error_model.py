@@ -23,11 +23,9 @@ from thermal_fiducial.core.types import BoolArray, FloatArray
 class SystematicErrors:
     """Standard deviations of the systematic errors; zero leaves one out."""
 
-    #: Corners [px]: model of the lens and bias of the detector, which last as long as the view. To begin with what a
-    #: published calibration leaves of a board of 36 tags (means over cells of 60 px: 0.08 and 0.09 px; body poses from
-    #: two cameras differ by 6.6 mm, NEES 2.4 without it, 0.9 with it, correlation 0.86 after 0.1 s, 0.36 after 4 s);
-    #: learned in flight from residuals that last (``CornerBias``). Enters poses from markers, map and new markers
-    #: (``LensErrors``).
+    #: Corners [px]: model of the lens and bias of the detector, which last as long as the view. Here what a good
+    #: calibration leaves; flights begin with more, and learn it from residuals that last (``CornerBias``). Enters poses
+    #: from markers, map and new markers (``LensErrors``).
     corner_px: float = 0.1
     #: Distance over which that error stays the same [share of the image's width]: a lens model is wrong by a smooth
     #: function. On the same board lengths of 0.1 to 0.25 fit, 0.5 leaves NEES 1.1, 1.0 leaves 1.25.
@@ -51,6 +49,9 @@ class SystematicErrors:
     #: begin with, and at most, as measured on rendered flights with three lenses and 0.5 to 9 K; learned in flight from
     #: residuals that last (``CornerBias``). Enters the covariance of a joint adjustment.
     marker_shape: float = 0.7
+    #: The most likely size of ``corner_px`` [px], which is the root of a mean: by it a marker's residuals are unusual.
+    #: Enters weights of markers.
+    likely_corner_px: float = 0.1
 
 
 #: 99.9 % quantile of chi square with eight degrees of freedom, of a view of a marker.

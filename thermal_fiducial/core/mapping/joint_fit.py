@@ -280,5 +280,5 @@ def marker_weights(errors_px: FloatArray, noise_px: FloatArray, model: Systemati
     ----------
     noise_px : (N,) standard deviation of a coordinate of the corners, by noise and survey
     """
-    expected = 2.0 * (noise_px**2 + model.corner_px**2)
+    expected = 2.0 * (noise_px**2 + model.likely_corner_px**2)
     return np.asarray(np.minimum(1.0, expected / np.maximum(errors_px**2, TINY)))

@@ -126,11 +126,8 @@ class MarkerMapper:
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.sizes):
             odometry, last = (None, self._last_at(stamp_ns)) if predicted is None else (predicted.pose, None)
-            fit = partial(locate, stamp_ns, camera=camera, odometry=odometry, last=last)
-            outcome = from_consistent_markers(sight, camera, predicted, partial(fit, model=self.errors))
-            if isinstance(outcome, Location) and (px := self._bias.at_first(outcome)) > self._bias.px:
-                model = replace(self.errors, corner_px=px)
-                outcome = from_consistent_markers(sight, camera, predicted, partial(fit, model=model))
+            fit = partial(locate, stamp_ns, camera=camera, model=self.errors, odometry=odometry, last=last)
+            outcome = from_consistent_markers(sight, camera, predicted, fit)
         elif len(known.sizes):
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
@@ -162,6 +159,7 @@ class MarkerMapper:
             marker_size_std=config.marker_size_std,
             focal_length_std=config.focal_length_std,
             marker_shape=self._bias.shape,
+            likely_corner_px=self._bias.likely_px,
         )
 
     def learn(self, frame: LocatedFrame) -> MapperResult:

@@ -227,7 +227,7 @@ def test_a_pose_that_hardly_fits_is_none():
 def test_weights_are_expected_over_present_variances_and_at_most_one():
     """A coordinate has noise of 0.1 and 0.2 px and a bias of 0.1 px: 0.2 px and 0.32 px are expected of both."""
     errors, noise = np.array([0.1, 0.2, 0.4, 0.4]), np.array([0.1, 0.1, 0.1, 0.2])
-    weights = marker_weights(errors, noise, SystematicErrors(corner_px=0.1))
+    weights = marker_weights(errors, noise, SystematicErrors(likely_corner_px=0.1))
     np.testing.assert_allclose(weights, [1.0, 1.0, 0.2**2 / 0.4**2, 0.1 / 0.4**2])
 
 

@@ -222,7 +222,8 @@ def test_the_covariance_carries_the_uncertainty_of_the_map():
     assert large is not None
     # A common error of all markers moves the camera as much: no number of markers averages it away.
     assert np.trace(large.covariance[:3, :3]) > np.trace(covariance[:3, :3])
-    assert np.trace(small.covariance[:3, :3]) < 1e-4
+    # 12 mm, by a lens of which nothing is known yet; the markers have 17.
+    assert np.trace(small.covariance[:3, :3]) < 0.5 * np.trace(covariance[:3, :3])
     assert np.linalg.eigvalsh(large.covariance)[0] > 0.0
 
 
