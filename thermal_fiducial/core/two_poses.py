@@ -10,11 +10,13 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.error_model import covariance_of_one_error
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, screw_difference, screwed, turned
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, screwed, turned
 from thermal_fiducial.core.geometry.se3 import so3_exp
 from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
 from thermal_fiducial.core.types import FloatArray
 
+#: Difference of chi square that rules out the worse of two poses, or of two markers: odds of e^-10.
+DECISIVE = 20.0
 #: Two poses are apart if half of the turn between them is as many standard deviations of each; else they are one, which
 #: is uncertain. Published with a tenth more, for the rounding of the covariance.
 APART = 3.0
@@ -38,8 +40,7 @@ def mean_of_two(mean: CameraPose, half: FloatArray) -> CameraPose:
         to_axis = np.cross(turn, half[:3]) / squared
         across = np.cross(turn, to_axis) / np.linalg.norm(to_axis)
         turns = half, np.concatenate([np.cross(to_axis, across), across])
-        unknown = (covariance_of_one_error(each, NOTHING_KNOWN / math.sqrt(squared)) for each in turns)
-        return replace(mean, covariance=mean.covariance + sum(unknown))
+        return replace(mean, covariance=mean.covariance + sum(map(unknown_turn, turns)))
     T = mean.T_map_camera
     ends = (difference(screwed(T, step), T) for step in (half, -half))
     spread = 0.5 * sum(map(covariance_of_one_error, ends))
@@ -79,8 +80,6 @@ def possible_poses(pose: CameraPose) -> list[CameraPose]:
     return poses
 
 
-def without_turn_to(T_other: FloatArray, pose: CameraPose) -> CameraPose:
-    """A pose that says nothing of the turn from it to another one (4, 4)."""
-    apart = screw_difference(T_other, pose.T_map_camera)
-    unknown = covariance_of_one_error(apart, NOTHING_KNOWN / float(np.linalg.norm(apart[3:])))
-    return replace(pose, covariance=pose.covariance + unknown)
+def unknown_turn(screw: FloatArray) -> FloatArray:
+    """Covariance (6, 6) by a turn along a ``screw`` (6,) of which nothing is known."""
+    return covariance_of_one_error(screw, NOTHING_KNOWN / float(np.linalg.norm(screw[3:])))

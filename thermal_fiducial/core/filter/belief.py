@@ -17,6 +17,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
 from thermal_fiducial.core.filter.state import Estimate, POSITION
 from thermal_fiducial.core.measurements import Condition
+from thermal_fiducial.core.two_poses import DECISIVE
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Poses that the alternative must accept for each one that the estimate accepts: an estimate with a wrong clock offset
@@ -26,8 +27,6 @@ _PREFERRED = 4
 REFUSALS_OF_DOUBT = 3
 #: Poses that the estimate must accept in a row for the alternative to be dropped.
 _REFUTED = 3
-#: Difference of the costs of two hypotheses that rules out the worse one: odds of e^-10, as in the mapper.
-DECISIVE = 20.0
 NEVER = -(1 << 62)
 #: Verdicts kept, and poses over which the diagnostics average the normalised innovation squared (NIS).
 _KEPT, _NIS_POSES = 300, 30

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.belief import Belief, DECISIVE, Hypothesis, PoseLog, PoseUpdate
+from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.hypotheses import (
     alternative_to,
     contradiction,
@@ -35,8 +35,9 @@ from thermal_fiducial.core.filter.state import (
     VELOCITY,
 )
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
+from thermal_fiducial.core.geometry.reprojection import screw_difference
 from thermal_fiducial.core.measurements import CameraPose, Condition
-from thermal_fiducial.core.two_poses import possible_poses, without_turn_to
+from thermal_fiducial.core.two_poses import DECISIVE, possible_poses, unknown_turn
 from thermal_fiducial.core.types import SECOND_NS
 
 #: A propagated belief is kept at this interval [ns], so that a pose begins there and not at the pose before.
@@ -337,7 +338,8 @@ class History:
         nearer, *farther = sorted(map(of, possible), key=attrgetter('nis'))
         if farther and farther[0].nis - nearer.nis < DECISIVE:
             # The estimate does not show which of the two it is: then nothing is known of the turn between them.
-            return of(without_turn_to(possible[0].T_map_camera, pose))
+            between = unknown_turn(screw_difference(possible[0].T_map_camera, pose.T_map_camera))
+            return of(replace(pose, covariance=pose.covariance + between))
         return nearer
 
     def _carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:

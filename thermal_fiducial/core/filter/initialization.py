@@ -41,7 +41,7 @@ LARGEST_TILT = math.radians(35.0)
 #: Standard deviation of the vertical by the mean of half a second of samples [rad]: the robot accelerates by 1 m/s^2.
 _VERTICAL_STD = 0.1
 #: Why nothing begins with a vague pose.
-TWO_POSES = Condition('two poses are possible', 'gravity does not show which one; move, or show another marker')
+TWO_POSES = Condition('two poses are possible', 'neither gravity nor motion shows which; move, or show another marker')
 
 
 def blank_state(config: PoseEkfConfig) -> NavigationState:

@@ -16,7 +16,6 @@ from thermal_fiducial.core.error_model import covariance_of_one_error, INCONSIST
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
-from thermal_fiducial.core.mapping.joint_fit import DECISIVE
 from thermal_fiducial.core.mapping.localization import names
 from thermal_fiducial.core.mapping.located import (
     error_std_px,
@@ -30,6 +29,7 @@ from thermal_fiducial.core.mapping.located import (
 from thermal_fiducial.core.mapping.map_data import MapMarker, MEMORY
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.motion_prior import PredictedCamera
+from thermal_fiducial.core.two_poses import DECISIVE
 from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
 
 #: Reason of quarantine of markers that the map file already had there.

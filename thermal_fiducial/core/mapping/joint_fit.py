@@ -26,10 +26,9 @@ from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.located import Location, Reprojected, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE
 from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
+from thermal_fiducial.core.two_poses import DECISIVE
 from thermal_fiducial.core.types import FloatArray, TINY
 
-#: Difference of chi square that rules out the worse of two poses, or of two markers: odds of e^-10.
-DECISIVE = 20.0
 #: Extent of the markers in view [rad] beyond which perspective resolves the planar ambiguity.
 WIDE = np.deg2rad(25.0)
 # Share of the largest weight from which on a marker counts for the extent of the markers in view.

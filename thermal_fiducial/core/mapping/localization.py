@@ -14,11 +14,11 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, screw_difference
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
-from thermal_fiducial.core.mapping.joint_fit import Alternative, DECISIVE, JointFit, SurveyedFit
+from thermal_fiducial.core.mapping.joint_fit import Alternative, JointFit, SurveyedFit
 from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
-from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
-from thermal_fiducial.core.two_poses import mean_of_two
+from thermal_fiducial.core.measurements import CameraPose, VAGUE
+from thermal_fiducial.core.two_poses import DECISIVE, mean_of_two, unknown_turn
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.core.wording import marker_names
 
@@ -95,14 +95,8 @@ def _by_odometry(frame: JointFit, found: Location, other: Alternative | None, od
         excess = cost - ends[0][0]
         if excess < DECISIVE and rotation_angle(T[:3, :3].T @ ends[0][1][:3, :3]) > SAME_POSE:
             # Odometry must not settle it twice, in the mapper and in the filter.
-            location = _without_turn_to(T, location)
+            location = _with_spread(location, unknown_turn(screw_difference(T, location.pose.T_map_camera)))
     return location
-
-
-def _without_turn_to(T_other: FloatArray, found: Location) -> Location:
-    """A location that says nothing of the turn from it to another pose (4, 4)."""
-    apart = screw_difference(T_other, found.pose.T_map_camera)
-    return _with_spread(found, covariance_of_one_error(apart, NOTHING_KNOWN / float(np.linalg.norm(apart[3:]))))
 
 
 def _widened(found: Location, other: Alternative) -> Location:
