@@ -5,7 +5,6 @@ import numpy as np
 from thermal_fiducial.core.types import BoolArray, IntArray, SECOND_NS
 from thermal_fiducial.report.bridge_check import Finding, Level
 from thermal_fiducial.report.bridge_record import BridgeRecord, LandingRecord
-from thermal_fiducial.report.metrics import rms
 from thermal_fiducial.ros.frames.landing_pad import from_mavros
 
 #: ArduPilot needs a target once a second; both autopilots drop a target after some seconds without a message [s].
@@ -50,7 +49,7 @@ def _place(record: LandingRecord, robot: BridgeRecord) -> Finding:
     if not in_map:
         targets = robots + (robot.rotations[nearest[near]] @ from_mavros(given)[:, :, None])[:, :, 0]
     below = float(np.median(robots[:, 2] - targets[:, 2]))
-    wanders = rms(np.linalg.norm(targets - np.median(targets, axis=0), axis=1))
+    wanders = float(np.sqrt(np.mean(np.sum((targets - np.median(targets, axis=0)) ** 2, axis=1))))
     moved = float(np.ptp(robots, axis=0).max())
     kind = 'in the map (PX4, LOCAL_NED)' if in_map else 'in the body (ArduPilot, BODY_FRD)'
     seen = f'{kind}, {below:.2f} m below, wanders by {wanders * 1e3:.0f} mm'

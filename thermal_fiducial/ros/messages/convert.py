@@ -119,7 +119,7 @@ def camera_info(calibration: 'Camera', head: Header) -> CameraInfo:
     message = CameraInfo(header=head, width=calibration.width, height=calibration.height)
     message.distortion_model = calibration.model
     message.d = calibration.D.tolist()
-    message.k = K.ravel()
+    message.k = K.flatten()
     message.r = np.eye(3).ravel()
     message.p = np.hstack([K, np.zeros((3, 1))]).ravel()
     return message
