@@ -743,9 +743,9 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         maximum=1.0,
     )
     extrinsics_orientation_std: float = param(
-        0.005,
-        'Standard deviation of camera_orientation about each axis: what its calibration leaves; the default is that of '
-        'a bracket measured by hand. 0: exact.',
+        0.003,
+        'Standard deviation of camera_orientation about each axis: what its calibration leaves; the default is what '
+        'calibrations of one rig differ by. 0: exact.',
         unit='rad',
         minimum=0.0,
         maximum=1.0,

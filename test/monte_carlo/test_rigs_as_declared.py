@@ -49,11 +49,11 @@ def test_claims_hold_over_rigs_as_the_parameters_declare_them(rigs, seconds):
 
 
 def test_a_bracket_measured_by_hand_is_within_the_claims():
-    """The camera turned by 0.5 deg, 5 mrad about each axis, and nothing said of it: the default."""
+    """The camera turned by 0.5 deg, 5 mrad about each axis, and nothing said of it: by default 3 mrad are claimed."""
     flight = first_seconds(simulated('cheap_imu', 0, 12.0), 6.0)
     turned = flight.T_body_camera @ transform(so3_exp(np.radians(0.5) * np.ones(3) / np.sqrt(3.0)), np.zeros(3))
     published = fly(replace(flight, T_body_camera=turned)).published
     settled = published.select(published.stamps_ns > published.stamps_ns[0] + SETTLED_NS).score(flight)
-    # One standard deviation about each axis, in half of the degrees of freedom: 0.5, and 0.1 as of an exact rig. Taken
-    # for known to 2 mrad it is 2.6.
-    assert settled.nees < 1.0
+    # 1.7 standard deviations about each axis, in half of the degrees of freedom: 1.4, and 0.1 as of an exact rig. Asked
+    # of claims is at most 2. Taken for known to 2 mrad it is 2.6.
+    assert settled.nees < 2.0
