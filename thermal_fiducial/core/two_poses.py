@@ -25,8 +25,11 @@ _CLEARLY_APART = 1.1 * APART
 _LARGEST_HALF = math.pi / 2.0
 
 
-def mean_of_two(mean: CameraPose, half: FloatArray) -> CameraPose:
+def mean_of_two(mean: CameraPose, half: FloatArray, likelier: CameraPose) -> CameraPose:
     """The ``mean`` of two poses, at the covariance that each has there, with both in its covariance.
+
+    If the two are not apart, it is the ``likelier`` one, which knows nothing of turns across the line of sight: from
+    the front the corners do not show about which axis the marker is turned.
 
     Parameters
     ----------
@@ -35,16 +38,17 @@ def mean_of_two(mean: CameraPose, half: FloatArray) -> CameraPose:
     turn = half[3:]
     squared = float(turn @ turn)
     own = float(turn @ (mean.covariance - mean.map_covariance)[3:, 3:] @ turn) / squared
-    if squared < max(VAGUE**2, _CLEARLY_APART**2 * own):
-        # From the front the corners do not show about which axis across the line of sight the marker is turned.
+    apart = squared >= max(VAGUE**2, _CLEARLY_APART**2 * own)
+    pose = mean if apart else likelier
+    ends = (difference(screwed(mean.T_map_camera, step), pose.T_map_camera) for step in (half, -half))
+    spread = 0.5 * sum(map(covariance_of_one_error, ends))
+    if not apart:
         to_axis = np.cross(turn, half[:3]) / squared
         across = np.cross(turn, to_axis) / np.linalg.norm(to_axis)
-        turns = half, np.concatenate([np.cross(to_axis, across), across])
-        return replace(mean, covariance=mean.covariance + sum(map(unknown_turn, turns)))
-    T = mean.T_map_camera
-    ends = (difference(screwed(T, step), T) for step in (half, -half))
-    spread = 0.5 * sum(map(covariance_of_one_error, ends))
-    return replace(mean, covariance=mean.covariance + spread)
+        to_pose = lever_arm(pose.T_map_camera[:3, 3] - mean.T_map_camera[:3, 3])
+        for unknown in (half, np.concatenate([np.cross(to_axis, across), across])):
+            spread += unknown_turn(to_pose @ unknown)
+    return replace(pose, covariance=pose.covariance + spread)
 
 
 def possible_poses(pose: CameraPose) -> list[CameraPose]:

@@ -145,21 +145,24 @@ def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPo
     chi2 = frame.fit.costs(np.stack([found.pose.T_map_camera, second.pose.T_map_camera]))
     chi2 *= decision_weights(frame.sight.noise_px, frame.model).min()
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
-    return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both, pose=_mean(found, second))
+    likelier, less_likely = (found, second) if chi2[0] <= chi2[1] else (second, found)
+    pose = _mean(likelier, less_likely)
+    return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both, pose=pose)
 
 
-def _mean(found: Location, second: Location) -> CameraPose:
+def _mean(likelier: Location, less_likely: Location) -> CameraPose:
     """The pose halfway along the screw from one of two possible poses to the other, with both in its covariance.
 
     Errors across the line of sight have opposite signs in the two, so the mean of both covariances has none of their
-    correlations with the others. That of the second is scaled to the first: its residuals have more than noise.
+    correlations with the others. That of the less likely one is scaled to the other: it has more than noise in its
+    residuals.
     """
-    T_second = second.pose.T_map_camera
-    mean = found.moved(0.5 * screw_difference(T_second, found.pose.T_map_camera), np.zeros((6, 6))).pose
-    scale = (found.rotation_std / second.rotation_std) ** 2
-    first, other = (pose.covariance - pose.map_covariance for pose in (found.pose, second.pose))
+    T_other = less_likely.pose.T_map_camera
+    mean = likelier.moved(0.5 * screw_difference(T_other, likelier.pose.T_map_camera), np.zeros((6, 6))).pose
+    scale = (likelier.rotation_std / less_likely.rotation_std) ** 2
+    first, other = (pose.covariance - pose.map_covariance for pose in (likelier.pose, less_likely.pose))
     at_own = replace(mean, covariance=0.5 * (first + scale * other) + mean.map_covariance)
-    return mean_of_two(at_own, screw_difference(T_second, mean.T_map_camera))
+    return mean_of_two(at_own, screw_difference(T_other, mean.T_map_camera), likelier.pose)
 
 
 def _cost_of_turn(pose: CameraPose, last: CameraPose) -> float:

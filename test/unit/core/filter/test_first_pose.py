@@ -33,7 +33,8 @@ def either(stamp_ns, T_map_body, axis, angle):
     to_camera = lever_arm(T[:3, 3] - MARKER)
     of_map = lever_arm(T[:3, 3]) @ np.diag(np.repeat((1e-3, 1e-4), 3) ** 2) @ lever_arm(T[:3, 3]).T
     own = to_camera @ at_marker @ to_camera.T
-    return mean_of_two(CameraPose(stamp_ns, T, own + of_map, of_map), half)
+    mean = CameraPose(stamp_ns, T, own + of_map, of_map)
+    return mean_of_two(mean, half, mean)
 
 
 def flown(axis, angle, speed=0.0, seconds=1.5):
