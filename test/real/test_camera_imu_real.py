@@ -57,8 +57,9 @@ def test_extrinsics_are_consistent_with_their_covariance(camera, seconds, every,
     assert np.degrees(np.linalg.norm(error[:3])) < off[0]
     assert np.linalg.norm(error[3:]) < off[1]
     # And the claim is of that order: 2 to 4 mm by the scatter of parts, 5 with a lens of which 0.1 px are declared. One
-    # that is estimated from the same corners moves the camera by 8 mm.
-    assert np.degrees(sigma[:3].max()) < 0.2
+    # that is estimated from the same corners moves the camera by 8 mm. About one axis 0.193 and 0.199 deg are claimed
+    # for the noise and walk of the accelerometer, 0.200 and 0.199 with the instability of its data sheet: a tenth more.
+    assert np.degrees(sigma[:3].max()) < 0.22
     assert sigma[3:].max() < 0.006
     # Gyroscope axes read half a per cent too little or too much; lens and focal length are known no better.
     assert np.all(np.abs(found.axes[[0, 4, 8]]) < 0.015)

@@ -2,7 +2,11 @@
 
 import argparse
 
+import numpy as np
+
 from thermal_fiducial.cli.parser import Parser
+from thermal_fiducial.cli.subcommands import warn
+from thermal_fiducial.core.detection.patterns import turned_alike
 from thermal_fiducial.core.types import Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -26,6 +30,8 @@ def chosen(args: argparse.Namespace) -> tuple[Gray, list[int]]:
     """
     bits = load_dictionary(args.dictionary).bits
     ids = list(range(len(bits))) if args.ids is None else _id_list(args.ids, len(bits), args.dictionary)
+    for index in np.flatnonzero(turned_alike(bits[ids])):
+        warn(f'marker {ids[index]} of {args.dictionary} looks the same upside down, shows no pose and is not detected')
     return bits, ids
 
 

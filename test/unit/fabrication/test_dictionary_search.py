@@ -105,6 +105,13 @@ def test_check_names_markers_that_are_negatives_of_one_another(capsys):
     assert 'negative' not in capsys.readouterr().out
 
 
+def test_check_names_a_marker_that_looks_the_same_upside_down(capsys):
+    assert main(['markers', 'check', '--dictionary', 'DICT_ARUCO_ORIGINAL', '--ids', '1022,1023']) == 0
+    assert capsys.readouterr().err == (
+        'warning: marker 1023 of DICT_ARUCO_ORIGINAL looks the same upside down, shows no pose and is not detected\n'
+    )
+
+
 def test_few_markers_of_a_dictionary_are_as_near_to_negatives_as_in_the_whole(capsys):
     """Measured by the distance of those chosen, marker 0 alone was like its own negative, 8 bits away."""
     assert main(['markers', 'check', '--mount', 'none', '--ids', '0']) == 0

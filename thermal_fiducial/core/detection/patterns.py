@@ -61,6 +61,11 @@ def correctable_bits(bits: Gray) -> int:
     return max((int(distance.min()) - 1) // 2, 0)
 
 
+def turned_alike(bits: Gray) -> BoolArray:
+    """Which of the markers (M, n, n) look the same upside down, so that they show no pose."""
+    return np.asarray((bits == np.rot90(bits, 2, axes=(1, 2))).all(axis=(1, 2)))
+
+
 @dataclass(frozen=True, slots=True)
 class Reading(Stacked):
     """Most similar markers of Q quadrilaterals, with the evidence for them."""
@@ -130,6 +135,8 @@ class Decoder:
         np.fill_diagonal(likeness, 0.0)
         #: (M,) margin of correlation of a perfect view of each marker over any other
         self.isolation = 1.0 - likeness.max(axis=1)
+        #: (M,) which markers show a pose
+        self.posed = ~turned_alike(bits)
         self._patterns = patterns.astype(np.float32)
         share = ((np.arange(self.cells)[:, None] + CELL_SAMPLES) / self.cells).ravel()
         self._samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share))).astype(np.float32)

@@ -127,6 +127,19 @@ def test_the_edge_of_a_warm_panel_does_not_hide_a_plate_beside_it_where_counts_a
     assert found_of_thirty(contrast, panel, SearchScales.ALL | SearchScales.CLIPPED) >= 27
 
 
+@pytest.mark.parametrize(('chosen', 'found'), [((), [[3], []]), ((3, 1023), [[3], []])])
+def test_a_marker_that_looks_the_same_upside_down_is_not_found(chosen, found):
+    """As its pose is one of two: a window in a panel, which is 1023, the only such marker of OpenCV's dictionaries."""
+    dictionary, ids = load_dictionary('DICT_ARUCO_ORIGINAL'), []
+    for marker_id in (3, 1023):
+        image = np.full((256, 320), 7200.0)
+        image[101:164, 141:204] = 7000.0 + 200.0 * np.kron(np.pad(dictionary.bits[marker_id], 1), np.ones((9, 9)))
+        image = np.rint(cv2.GaussianBlur(image, (0, 0), 0.7)).astype(np.uint16)
+        detector = MarkerDetector(ArucoDetectorConfig(whitelist=chosen), dictionary)
+        ids.append(detector.detect(1, image, frame_of(image.astype(np.float32)).camera)['id'].tolist())
+    assert ids == found
+
+
 def test_counts_are_clipped_in_turn_until_a_marker_is_found():
     detector = MarkerDetector(ArucoDetectorConfig(), Dictionary(BITS, 1))
     image = np.rint(in_plate(3, 40.0, touching_flame(800.0))).astype(np.uint16)

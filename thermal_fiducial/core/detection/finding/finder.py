@@ -180,13 +180,13 @@ class MarkerFinder:
         return FoundMarkers(ids, places, blind.cnr[possible], no, no)
 
     def allowed(self, known: KnownMarkers, config: ArucoDetectorConfig) -> BoolArray:
-        """Which IDs of the dictionary may be found."""
+        """Which IDs of the dictionary may be found: of those that show a pose."""
         # With those in quarantine: only a marker that is found can be released.
         by_map = config.whitelist_from_map and len(known.mapped) > 0
         wanted = known.mapped if by_map else np.array(config.whitelist, dtype=int)
         if len(wanted) == 0:
-            return np.ones(self._decoder.count, dtype=bool)
-        return np.asarray(np.isin(np.arange(self._decoder.count), wanted))
+            return self._decoder.posed
+        return np.asarray(np.isin(np.arange(self._decoder.count), wanted) & self._decoder.posed)
 
 
 def _next_scales(history: FrameHistory, found: FoundMarkers, *, complete: bool) -> SearchScales:
