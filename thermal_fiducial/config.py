@@ -469,12 +469,6 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
         minimum=0.0,
         maximum=0.05,
     )
-    refinement: str = param(
-        'auto',
-        "Corner refinement. auto, edges: intersections of fitted side lines; subpix: OpenCV's cornerSubPix.",
-        choices=('auto', 'edges', 'subpix'),
-        dynamic=True,
-    )
     whitelist: tuple[int, ...] = param((), 'IDs that may be found. Empty: all of the dictionary.')
     whitelist_from_map: bool = param(False, 'Find only the markers of the map, where there is one.')
     polarity: str = param(

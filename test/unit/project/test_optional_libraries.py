@@ -169,7 +169,7 @@ IN_OPENCV_4_6 = """
     IMREAD_IGNORE_ORIENTATION IMREAD_UNCHANGED INTER_AREA INTER_CUBIC INTER_LANCZOS4 INTER_LINEAR MORPH_CLOSE MORPH_OPEN
     REDUCE_AVG REDUCE_SUM RETR_LIST Sobel TERM_CRITERIA_EPS TERM_CRITERIA_MAX_ITER VideoCapture WARP_INVERSE_MAP
     __version__ absdiff addWeighted approxPolyDP arcLength aruco.getPredefinedDictionary blur circle compare contourArea
-    convertScaleAbs convexHull copyMakeBorder cornerSubPix cvtColor distanceTransformWithLabels error fillConvexPoly
+    convertScaleAbs convexHull copyMakeBorder cvtColor distanceTransformWithLabels error fillConvexPoly
     findContours fisheye.projectPoints fisheye.undistortPoints getNumThreads getPerspectiveTransform imdecode
     imreadmulti medianBlur morphologyEx polylines projectPoints putText reduce remap resize setNumThreads subtract
     warpAffine

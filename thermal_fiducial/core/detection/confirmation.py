@@ -4,13 +4,10 @@ A marker is confirmed by the correlation of its pattern. Those whose cells are h
 by the evidence of the fit of their pattern, or like the others.
 """
 
-from dataclasses import replace
-
-import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corners.corner_errors import BLURRED_OUT, OF_LOCAL_PX, RefinedCorners
+from thermal_fiducial.core.detection.corners.corner_errors import BLURRED_OUT, RefinedCorners
 from thermal_fiducial.core.detection.corners.refining import RefinedMarkers
 from thermal_fiducial.core.detection.finding.quads import halfway, halved
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
@@ -44,27 +41,6 @@ _OFF_SQUARE_CELLS = 0.1
 _SIGMAS = 3.0
 # Displacement or standard deviation of blur that cells are read in spite of [cells].
 _LITTLE = 0.1
-# Half the window of ``cornerSubPix``: in cells, and at most in pixels.
-_WINDOW_IN_CELLS, _LARGEST_WINDOW = 0.3, 5
-_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
-# Largest step of ``cornerSubPix`` that is accepted [cells].
-_LOST_CELLS = 0.4
-
-
-def local_corners(image: Float32Array, refined: RefinedCorners, cells: int) -> RefinedCorners:
-    """Corners (N, 4, 2) by ``cv2.cornerSubPix``; those that move too far keep their refined place.
-
-    These lie a few tenths of a pixel inside the intersections of the sides, because blur rounds corners.
-    """
-    corners = refined.corners_px.copy()
-    for index, start in enumerate(refined.corners_px):
-        cell = np.linalg.norm(start[2] - start[0]) / (np.sqrt(2.0) * cells)
-        window = int(np.clip(round(_WINDOW_IN_CELLS * cell), 1, _LARGEST_WINDOW))
-        points = start.astype(np.float32).reshape(-1, 1, 2)
-        found = cv2.cornerSubPix(image, points, (window, window), (-1, -1), _STOP).reshape(4, 2).astype(np.float64)
-        near = np.abs(found - start).max(axis=1) < max(1.0, _LOST_CELLS * cell)
-        corners[index, near] = found[near]
-    return replace(refined, corners_px=corners, covariances=refined.covariances + OF_LOCAL_PX**2 * np.eye(2))
 
 
 def confirmed(
@@ -74,7 +50,7 @@ def confirmed(
     decoder: Decoder,
     config: ArucoDetectorConfig,
 ) -> RefinedMarkers:
-    """The markers ``found`` that show their pattern at the refined corners and are squares, with corners to publish."""
+    """The markers ``found`` that show their pattern at the refined corners and are squares."""
     if len(found.ids) == 0:
         return markers
     corners = markers.observed.corners_px
@@ -91,10 +67,7 @@ def confirmed(
         own = np.minimum(frame.noise / markers.observed.noise[doubtful], 1.0) ** 2
         variance = own * markers.observed.mean_variance[doubtful]
         keep[doubtful] = _square(ImagePoints.at(corners[doubtful], frame.camera), variance, decoder.cells)
-    markers = markers if keep.all() else markers.only(keep)
-    if config.refinement == 'subpix':
-        return replace(markers, corners=local_corners(frame.image, markers.corners, decoder.cells))
-    return markers
+    return markers if keep.all() else markers.only(keep)
 
 
 def _square(at: ImagePoints, variance: FloatArray, cells: int) -> BoolArray:

@@ -14,8 +14,6 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked, TINY
 OF_SIDES_PX = 0.010
 #: Part of that error that the four sides of a marker have in common [px].
 OF_ALL_SIDES_PX = 0.005
-#: A corner by ``cornerSubPix`` on thermal frames [px]: blur rounds it.
-OF_LOCAL_PX = 0.18
 #: A corner by the whole pattern of a small marker [px]: the blur of the optics is not quite a Gaussian. Rendered frames
 #: without noise.
 OF_PATTERN_PX = 0.006
