@@ -503,16 +503,6 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
         maximum=1.0,
         dynamic=True,
     )
-    max_bit_errors: int = param(
-        -1,
-        'Most bits on the wrong side of the threshold between black and white. -1: as many as the dictionary corrects.',
-        minimum=-1,
-        maximum=20,
-        dynamic=True,
-    )
-    max_border_errors: int = param(
-        2, 'Most cells of the black border on the wrong side.', minimum=0, maximum=20, dynamic=True
-    )
     guided: bool = param(True, 'Search for mapped markers where map and odometry predict them.', dynamic=True)
     blind_period: float = param(
         0.32,

@@ -82,8 +82,6 @@ class Reading(Stacked):
     contrast: FloatArray
     #: (Q,) bits on the wrong side of the middle between black and white
     bit_errors: IntArray
-    #: (Q,) border cells on the wrong side of that middle
-    border_errors: IntArray
     #: (Q,) step from the black border to its white surroundings over the contrast, on the second worst side; 0 if the
     #: correlation is low
     surround: FloatArray
@@ -120,7 +118,7 @@ class Decoder:
         self.correctable = correctable
         grid = np.pad(bits.astype(np.float64), ((0, 0), (1, 1), (1, 1)))
         self.count, self.cells = len(grid), grid.shape[-1]
-        self._border = np.pad(np.zeros(bits.shape[1:], dtype=bool), 1, constant_values=True).ravel()
+        self._inner = np.pad(np.ones(bits.shape[1:], dtype=bool), 1).ravel()
         # Pattern k after `turn` steps: as it looks in a quadrilateral whose first corner is the marker's corner `turn`.
         self._grids = np.stack([np.rot90(grid, turn, axes=(1, 2)) for turn in range(4)], axis=1)
         flat = self._grids.reshape(-1, self.cells**2)
@@ -158,7 +156,7 @@ class Decoder:
         if len(quads) == 0:
             nothing = np.zeros(0)
             none = nothing.astype(np.int64)
-            return Reading(none, none, nothing, nothing, nothing, none, none, nothing)
+            return Reading(none, none, nothing, nothing, nothing, none, nothing)
         match = self.likeness(image, quads, allowed, lag_tails)
         steps = np.zeros((len(quads), 4))
         alike = np.flatnonzero(np.abs(match.correlation) >= _SIMILAR)
@@ -218,8 +216,7 @@ class Decoder:
             match.correlation,
             match.runner_up,
             contrast,
-            np.sum(wrong & ~self._border, axis=1),
-            np.sum(wrong & self._border, axis=1),
+            np.sum(wrong & self._inner, axis=1),
             np.sort(steps / safe, axis=1)[:, 1],
         )
 

@@ -40,9 +40,7 @@ class OtherDictionaries:
 
     def configure(self, config: ArucoDetectorConfig) -> None:
         """Take over the detector's dynamic parameters, as far as they say what is visible."""
-        self._config = replace(
-            config, max_bit_errors=0, guided=False, polarity='any', whitelist=(), whitelist_from_map=False
-        )
+        self._config = replace(config, guided=False, polarity='any', whitelist=(), whitelist_from_map=False)
 
     def settle(self) -> None:
         """Look no more: a filter that runs has poses by our markers, and a look would delay the next frame."""
@@ -81,5 +79,6 @@ class OtherDictionaries:
 
     def _exact(self, name: str, image: Counts | Gray, camera: Camera) -> set[int]:
         """IDs in an image that has nothing to do with the one before it: a detector that knows of none."""
-        rows = MarkerDetector(self._config, load_dictionary(name)).detect(0, image, camera)
+        exact = replace(load_dictionary(name), correctable=0)
+        rows = MarkerDetector(self._config, exact).detect(0, image, camera)
         return {int(marker_id) for marker_id in rows['id']}

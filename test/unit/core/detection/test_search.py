@@ -63,7 +63,6 @@ def test_decoder_names_id_turn_and_polarity(turn, sign):
     assert sign * reading.correlation[0] > 0.99
     assert reading.contrast[0] == pytest.approx(sign * 100.0, rel=0.05)
     assert reading.bit_errors[0] == 0
-    assert reading.border_errors[0] == 0
 
 
 def test_plate_shrinks_to_its_marker():
@@ -190,7 +189,6 @@ def test_edge_of_a_plate_is_no_markerinside_out(sign):
         correlation,
         np.full(4, 0.6),
         100.0 * correlation,
-        np.zeros(4, dtype=np.int64),
         np.zeros(4, dtype=np.int64),
         np.array([0.5, 1.2, 0.9, 1.0]),
     )

@@ -193,14 +193,9 @@ def distinct(reading: Reading, noise: float, config: ArucoDetectorConfig) -> Boo
 
 
 def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDetectorConfig) -> BoolArray:
-    """Which readings suffice for a marker that was not predicted: also few wrong cells, and white surroundings."""
-    bits = config.max_bit_errors if config.max_bit_errors >= 0 else correctable
-    return np.asarray(
-        distinct(reading, noise, config)
-        & (reading.bit_errors <= bits)
-        & (reading.border_errors <= config.max_border_errors)
-        & (reading.surround >= config.min_surround)
-    )
+    """Which readings suffice for a marker that was not predicted: also few wrong bits, and white surroundings."""
+    right = (reading.bit_errors <= correctable) & (reading.surround >= config.min_surround)
+    return np.asarray(distinct(reading, noise, config) & right)
 
 
 def inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: BoolArray) -> BoolArray:
