@@ -28,6 +28,7 @@ from thermal_fiducial.cli.subcommands import (
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.mapping.map_data import MarkerMap
+from thermal_fiducial.core.measurements import places_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import save_camera
@@ -214,7 +215,7 @@ def mapped_detector(board: MarkerMap, thickness: float = 0.0) -> MarkerDetector:
     """Detector with the markers of ``board``, plates of ``thickness`` [m], as its map."""
     config = ArucoDetectorConfig(dictionary=board.dictionary, plate_thickness=thickness)
     detector = MarkerDetector(config, load_dictionary(board.dictionary))
-    detector.set_map(board.geometry())
+    detector.set_map(*places_of(board.rows()))
     return detector
 
 

@@ -13,7 +13,7 @@ from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.measurements import MARKER_DTYPE
+from thermal_fiducial.core.measurements import MARKER_DTYPE, places_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import marker_grid
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -45,7 +45,7 @@ def test_marker_board_calibrates():
     marker_map, levels = board()
     lens = LENSES['13mm']
     detector = MarkerDetector(ArucoDetectorConfig(dictionary=NAME), load_dictionary(NAME))
-    detector.set_map(marker_map.geometry())
+    detector.set_map(*places_of(marker_map.rows()))
     target = MarkerBoard(marker_map, detector)
     camera = Camera(640, 512, lens.matrix, lens.model, np.array(lens.distortion))
     rows, columns = levels.shape

@@ -123,10 +123,6 @@ class MarkerMap:
         }
         return replace(self, markers=self.markers | drawn)
 
-    def geometry(self) -> dict[int, tuple[FloatArray, float]]:
-        """Marker ID to (T_map_marker, size): what a detector needs to look for them."""
-        return {marker.id: (marker.T_map_marker, marker.size) for marker in self.markers.values()}
-
     @property
     def anchors(self) -> FloatArray:
         """Positions (H, 3) of the markers that carry the scale: see :func:`gauge`."""
