@@ -85,13 +85,14 @@ def test_the_fused_pose_is_nearer_to_the_truth_than_its_markers(camera, other, s
 
 
 @each_judge
-def test_claims_before_the_board_are_consistent(request, camera, other, seconds):
-    if camera == 'cam1':
-        reason = '7.8 mm are claimed where 5.1 are true: NEES 0.49 in place of 0.5'
-        request.applymarker(pytest.mark.xfail(reason=reason))
-    fused, _ = judged_by(other, board_run(camera, seconds))
-    # Asked of the claims, as the judge has errors of its own; measured 0.66 and 0.49, of 15 s 0.95.
-    assert 0.5 < fused.nees < 2.0
+def test_claims_before_the_board_are_consistent(camera, other, seconds):
+    run = board_run(camera, seconds)
+    # The judge's place on the body is its mean one beside the reference, so an error of the mount does not show. (By
+    # default 3 mrad about each axis are claimed of it: NEES 0.47 and 0.39, of 15 s 0.52.)
+    mounted = replace(run.config, extrinsics_orientation_std=0.0, extrinsics_position_std=0.0)
+    fused, _ = judged_by(other, replace(run, config=mounted))
+    # Asked of claims. Measured 0.85 and 0.74, of 15 s 0.91; a fifth of these squares are the judge's own 2.5 mm.
+    assert 0.7 < fused.nees < 1.4
 
 
 #: Eight seconds have 13 gaps of more than 0.1 s; the error behind the longest ones is looked at at night.
