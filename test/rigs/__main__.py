@@ -7,6 +7,7 @@ import sys
 from support.jobs import Died, outcomes
 
 from rigs.flight import fly
+from rigs.rig import SECONDS
 from rigs.score import Score
 from rigs.table import line, table
 
@@ -16,11 +17,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog='rigs', description=__doc__)
     parser.add_argument('begin', type=int, help='first seed')
     parser.add_argument('end', type=int, help='seed after the last')
+    parser.add_argument(
+        '--as-drawn', action='store_true', help='declare how large errors are where defaults claim more'
+    )
     parser.add_argument('--workers', type=int, default=2, help='processes')
     arguments = parser.parse_args()
-    seeds = deque((seed,) for seed in range(arguments.begin, arguments.end))
+    seeds = deque((seed, SECONDS, arguments.as_drawn) for seed in range(arguments.begin, arguments.end))
     scores: dict[int, list[Score]] = {}
-    for (seed,), result in outcomes(fly, seeds, arguments.workers):
+    for (seed, *_), result in outcomes(fly, seeds, arguments.workers):
         if isinstance(result, Died):
             raise RuntimeError(f'the process of seed {seed} was killed')
         description, scores[seed] = result

@@ -1,6 +1,6 @@
 """A flight through ``Pipeline``, as samples and frames arrive, and what its poses and its map are worth."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 import heapq
 from itertools import takewhile
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from rigs import inertial, motion, room
 from rigs.bolometer import Bolometer
 from rigs.display import shown
 from rigs.motion import Path
-from rigs.rig import Rig, SECONDS
+from rigs.rig import AS_DRAWN, Rig, SECONDS
 from rigs.room import Room
 from rigs.score import Score, Worth
 from thermal_fiducial import Camera, ImuSample, load_dictionary, MarkerMap, Odometry, Pipeline
@@ -41,15 +41,16 @@ class Arrival(NamedTuple):
 
 
 class Flown:
-    """A pipeline in flight, beside the truth."""
+    """A pipeline in flight, beside the truth; ``as_drawn``: its parameters say how large the rig's errors are."""
 
-    def __init__(self, rig: Rig, scene: Room, path: Path, dictionary: Dictionary, mode: str) -> None:
+    def __init__(
+        self, rig: Rig, scene: Room, path: Path, dictionary: Dictionary, mode: str, as_drawn: bool = False
+    ) -> None:
         self._rig, self._room, self._path, self._mode = rig, scene, path, mode
         known = scene.plates if mode == 'localization' else dict([next(iter(scene.plates.items()))])
         markers = {i: MapMarker(i, plate.size, True, plate.T_map_plate) for i, plate in known.items()}
-        self.pipeline = Pipeline(
-            _config(rig, mode), dictionary, MarkerMap(markers, dictionary=rig.task.dictionary), _camera(rig)
-        )
+        config = _config(rig, mode, AS_DRAWN if as_drawn else {})
+        self.pipeline = Pipeline(config, dictionary, MarkerMap(markers, dictionary=rig.task.dictionary), _camera(rig))
         # With each, whether the filter declared itself lost.
         self._states: list[tuple[Odometry, bool]] = []
         self._in_view = self._found = self._false = 0
@@ -114,8 +115,8 @@ def _camera(rig: Rig) -> Camera:
     return Camera(lens.width, lens.height, lens.matrix, 'plumb_bob', np.append(lens.distortion, 0.0))
 
 
-def _config(rig: Rig, mode: str) -> PipelineConfig:
-    """Defaults but for what a rig is."""
+def _config(rig: Rig, mode: str, declared: Mapping[str, float]) -> PipelineConfig:
+    """Defaults but for what a rig is, and for what is ``declared`` of its errors."""
     T = rig.T_calibrated
     return PipelineConfig.from_mapping(
         {
@@ -127,6 +128,7 @@ def _config(rig: Rig, mode: str) -> PipelineConfig:
             'imu.gyroscope_noise_density': float(rig.imu.density[0]),
             'imu.accelerometer_noise_density': float(rig.imu.density[3]),
         }
+        | dict(declared)
     )
 
 
@@ -147,14 +149,17 @@ def _frames(rig: Rig, scene: Room, path: Path) -> Iterator[Arrival]:
             yield Arrival(last, t, t - link.offset + wrong, image)
 
 
-def fly(seed: int, until: float = SECONDS) -> tuple[str, list[Score]]:
-    """Description of the rig of a seed, and its scores in each mode, of a flight until then [s]."""
+def fly(seed: int, until: float = SECONDS, as_drawn: bool = False) -> tuple[str, list[Score]]:
+    """Description of the rig of a seed, and its scores in each mode, of a flight until then [s].
+
+    ``as_drawn``: with parameters that say how large the rig's errors are, where the defaults claim more.
+    """
     # Each core has a flight of its own.
     cv2.setNumThreads(1)
     rig = Rig(seed)
     dictionary = load_dictionary(rig.task.dictionary)
     scene, path = room.drawn(rig, dictionary.bits), motion.drawn(rig)
-    flown = [Flown(rig, scene, path, dictionary, mode) for mode in MODES]
+    flown = [Flown(rig, scene, path, dictionary, mode, as_drawn) for mode in MODES]
     for arrival in takewhile(lambda arrival: arrival.when < until, arrivals(rig, scene, path)):
         for flight in flown:
             flight.take(arrival)
