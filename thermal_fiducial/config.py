@@ -346,6 +346,27 @@ class MountParameters(SelfChecked):
 
 
 @dataclass(frozen=True)
+class MountErrorParameters(MountParameters):
+    """Where the camera is on the robot, and how well that is known."""
+
+    extrinsics_position_std: float = param(
+        0.002,
+        'Standard deviation of camera_position, and of that of a second camera: what its calibration leaves. 0: exact.',
+        unit='m',
+        minimum=0.0,
+        maximum=1.0,
+    )
+    extrinsics_orientation_std: float = param(
+        0.003,
+        'Standard deviation of camera_orientation, and of that of a second camera, about each axis: what its '
+        'calibration leaves; the default is what calibrations of one rig differ by. 0: exact.',
+        unit='rad',
+        minimum=0.0,
+        maximum=1.0,
+    )
+
+
+@dataclass(frozen=True)
 class ClockParameters(SelfChecked):
     """The camera's clock against the IMU's, and how well it is known."""
 
@@ -553,7 +574,7 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
 
 
 @dataclass(frozen=True)
-class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, MountParameters, MarkerParameters):
+class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, MountErrorParameters, MarkerParameters):
     """The incremental marker map."""
 
     map_file: str = param('', 'Marker map (YAML). Empty: no map.', path=True)
@@ -699,7 +720,7 @@ class ImuNoise(SelfChecked):
 
 
 @dataclass(frozen=True)
-class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountParameters):
+class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountErrorParameters):
     """The filter."""
 
     estimate_time_offset: bool = param(True, 'Estimate the error of camera_time_offset.')
@@ -718,21 +739,6 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountP
         unit='rad',
         minimum=0.0,
         maximum=0.01,
-    )
-    extrinsics_position_std: float = param(
-        0.002,
-        'Standard deviation of camera_position: what its calibration leaves. 0: exact.',
-        unit='m',
-        minimum=0.0,
-        maximum=1.0,
-    )
-    extrinsics_orientation_std: float = param(
-        0.003,
-        'Standard deviation of camera_orientation about each axis: what its calibration leaves; the default is what '
-        'calibrations of one rig differ by. 0: exact.',
-        unit='rad',
-        minimum=0.0,
-        maximum=1.0,
     )
     imu: ImuNoise = group(ImuNoise)  # noqa: RUF009
     gravity: float = param(9.80665, 'Local gravity.', unit='m/s^2', minimum=9.7, maximum=9.9)

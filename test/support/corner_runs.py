@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from support.flights import rms
 from thermal_fiducial.config import ImuNoise, MarkerMapperConfig, PoseEkfConfig
+from thermal_fiducial.core.error_model import covariance_of_mount
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import (
@@ -178,7 +179,9 @@ class _Chain:
     def add_camera(self, flight):
         """The same flight through a second camera, in the same map."""
         self._second = _Chain(flight, self.mapper.map, 'localization', {})
-        self._pair = SecondCamera(self.flight.T_body_camera, flight.T_body_camera, self.config.time_offset_std)
+        mounts = covariance_of_mount(self.config.extrinsics_position_std, self.config.extrinsics_orientation_std)
+        places = self.flight.T_body_camera, flight.T_body_camera
+        self._pair = SecondCamera(*places, mounts, self.config.time_offset_std)
 
     def add_second_frame(self, stamp_ns) -> None:
         flight, mapper = self._second.flight, self._second.mapper

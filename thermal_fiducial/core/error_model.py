@@ -110,6 +110,11 @@ def covariance_of_motion(twist_covariance: FloatArray, seconds: float) -> FloatA
     return np.asarray(seconds**2 * twist_covariance + 0.25 * seconds**4 * UNKNOWN_ACCELERATION)
 
 
+def covariance_of_mount(position_std: float, orientation_std: float) -> FloatArray:
+    """Covariance (6, 6) of a camera on the robot, by what its calibration leaves [m, rad]: the same in all axes."""
+    return np.diag(np.repeat([position_std, orientation_std], 3) ** 2)
+
+
 # The map, from a joint adjustment.
 
 

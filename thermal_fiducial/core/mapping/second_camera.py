@@ -31,6 +31,8 @@ _LATE_NS = 87_000_000
 _DOUBT = 2.0
 # Ratio of determinants below which one pose is better than both together: two that are as good are averaged.
 _CLEARLY = 0.999
+# Covariance of a mount that is exact.
+_EXACT: FloatArray = np.zeros((6, 6))
 
 
 class SecondClock:
@@ -77,6 +79,7 @@ class SecondCamera:
     Parameters
     ----------
     T_body_first, T_body_second : (4, 4) the cameras on the robot
+    mount_covariance : (6, 6) of each of these places, see :func:`covariance_of_mount`
     time_offset_std, time_offset_random_walk : of the difference of their clocks, see :class:`SecondClock`
     """
 
@@ -84,11 +87,13 @@ class SecondCamera:
         self,
         T_body_first: FloatArray,
         T_body_second: FloatArray,
+        mount_covariance: FloatArray = _EXACT,
         time_offset_std: float = 0.0,
         time_offset_random_walk: float = 0.0,
     ) -> None:
         self._T_body_first = T_body_first
         self._T_second_first = inverse(T_body_second) @ T_body_first
+        self._mount_covariance = mount_covariance
         self._waiting: CameraPose | None = None
         #: stamps of the cameras' last poses, and period of the first one's
         self._first_ns: int | None = None
@@ -100,7 +105,7 @@ class SecondCamera:
 
     def add_second(self, pose: CameraPose, prior: MotionPrior) -> CameraPose | None:
         """Add a pose of the second camera; returned as a pose of the first, in its clock, while that has none."""
-        pose = seen_from(pose, self._T_second_first)
+        pose = self._of_first(pose)
         if pose.stamp_ns < self._second_ns - LATEST_NS:
             # The clock was set back: the first one's last pose says nothing of now.
             self._first_ns = None
@@ -111,6 +116,12 @@ class SecondCamera:
             return pose if in_clock is None else in_clock[0]
         self._waiting = pose
         return None
+
+    def _of_first(self, pose: CameraPose) -> CameraPose:
+        """A pose of the second camera as one of the first: the errors of both mounts are between the two."""
+        with_own = replace(pose, covariance=pose.covariance + self._mount_covariance)
+        of_first = seen_from(with_own, self._T_second_first)
+        return replace(of_first, covariance=of_first.covariance + self._mount_covariance)
 
     def forget(self) -> None:
         """Drop the pose that waits for one of the first camera: it is in a map that was replaced."""

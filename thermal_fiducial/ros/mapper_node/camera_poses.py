@@ -7,6 +7,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.error_model import covariance_of_mount
 from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.second_camera import SecondCamera
@@ -102,7 +103,8 @@ def _places(config: MarkerMapperConfig) -> tuple[tuple[float, ...], ...]:
 
 def _second_of(config: MarkerMapperConfig) -> SecondCamera:
     first, second = camera_in_body(config), camera_in_body(_alone(config))
-    return SecondCamera(first, second, config.time_offset_std, config.time_offset_random_walk)
+    mounts = covariance_of_mount(config.extrinsics_position_std, config.extrinsics_orientation_std)
+    return SecondCamera(first, second, mounts, config.time_offset_std, config.time_offset_random_walk)
 
 
 def _alone(config: MarkerMapperConfig) -> MarkerMapperConfig:

@@ -14,7 +14,8 @@ from support.messages import frames, info
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector, rows_from_corners
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
+from thermal_fiducial.core.error_model import covariance_of_mount
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, reproject
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.second_camera import intersection, SecondCamera, SecondClock, seen_from
 from thermal_fiducial.core.measurements import CameraPose, MARKER_DTYPE, Odometry
@@ -122,6 +123,28 @@ def test_poses_that_contradict_each_other_are_not_joined():
     cameras.add_second(second_pose(100 * MS, transform(np.eye(3), [0.5, 0.0, 0.0])), MotionPrior())
     assert cameras.with_second(first, MotionPrior()) is first
     assert (cameras.joined, cameras.contradicted) == (0, 1)
+
+
+def test_mounts_that_are_off_as_declared_contradict_nothing_and_are_claimed():
+    """Two mounts good to 2 mm and 3 mrad, 300 rigs: poses of 0.3 mm and 0.3 mrad differ by their mounts alone."""
+    rng, stds = np.random.default_rng(6), (2e-3, 3e-3)
+    mounts, variances, squares = covariance_of_mount(*stds), (1e-7,) * 6, []
+    contradicted = 0
+    for _ in range(300):
+        off = [transform(so3_exp(stds[1] * rng.normal(size=3)), stds[0] * rng.normal(size=3)) for _ in range(2)]
+        cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND, mounts)
+        # Where the cameras are; the parameters have their places without these errors.
+        first, second = T_BODY_FIRST @ off[0], T_BODY_SECOND @ off[1]
+        alone = cameras.add_second(pose(0, second, variances), MotionPrior())
+        error = difference(first, alone.T_map_camera)
+        squares.append(error @ np.linalg.solve(alone.covariance, error) / 6.0)
+        cameras.with_second(pose(100 * MS, first, variances), MotionPrior())
+        cameras.add_second(pose(200 * MS, second, variances), MotionPrior())
+        cameras.with_second(pose(200 * MS, first, variances), MotionPrior())
+        contradicted += cameras.contradicted
+    # One in a thousand is expected; a mean of 1800 squares scatters by 0.033.
+    assert contradicted <= 3
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize('lead_ms', [0, 50, -10])
@@ -320,6 +343,16 @@ def test_what_waits_of_the_second_camera_is_not_joined_in_another_map(graph, map
     # The corners are exact, but for their single precision.
     np.testing.assert_allclose(after - before, T_new_old[:3, 3], atol=1e-4)
     assert graph.diagnose(mapper_of_two)[2]['second camera: joined'] == '0'
+
+
+@pytest.mark.ros
+def test_poses_of_the_second_camera_alone_claim_what_both_mounts_leave(graph, mapper_of_two):
+    """The cameras are at one place: twice what the parameters say by default, with what the corners leave."""
+    graph.listen(PoseWithCovarianceStamped, 'camera_pose')
+    graph.send('down/markers', corners_in_view(small_bag.START_NS, moved=False))
+    graph.spin_until(lambda: graph.heard['camera_pose'])
+    covariance = np.reshape(graph.heard['camera_pose'][0].pose.covariance, (6, 6))
+    assert np.all(np.diag(covariance) > 2.0 * np.diag(covariance_of_mount(2e-3, 3e-3)))
 
 
 @pytest.mark.ros
