@@ -39,8 +39,10 @@ def render(lens, T_camera_plate, levels, width, height, contrast, seed, *, opaqu
     cold, hot = (0.0, contrast) if contrast > 0 else (-contrast, 0.0)
     plate = Plate(T_camera_plate, width, height, levels.astype(float), opaque, hot, cold)
     room = Room((-30.0, -30.0, -30.0), (30.0, 30.0, 30.0))
-    quality = Quality(samples=samples, warm_up=0)
-    renderer = Renderer(lens, [plate], room, Fog(), Acrylic(), STILL, np.eye(4), lag=0.0, quality=quality)
+    quality, blur = Quality(samples=samples, warm_up=0), SENSOR.psf_sigma_px
+    renderer = Renderer(
+        lens, [plate], room, Fog(), Acrylic(), STILL, np.eye(4), lag=0.0, quality=quality, psf_sigma_px=blur
+    )
     return SENSOR.counts(renderer.frame(TIME), TIME, 0, seed)
 
 

@@ -87,8 +87,10 @@ def render_view(
         np.arange(8.0), np.zeros((8, 3)), Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (8, 1)))
     )
     room = Room((-30.0, -30.0, -30.0), (30.0, 30.0, 30.0))
-    quality = Quality(samples=97, warm_up=0)
-    renderer = Renderer(lens, plates, room, Fog(), Acrylic(), still, np.eye(4), lag=0.0, quality=quality)
+    quality, blur = Quality(samples=97, warm_up=0), _SENSOR.psf_sigma_px
+    renderer = Renderer(
+        lens, plates, room, Fog(), Acrylic(), still, np.eye(4), lag=0.0, quality=quality, psf_sigma_px=blur
+    )
     counts = _SENSOR.counts(renderer.frame(_TIME), _TIME, 0, int(rng.integers(1 << 31)))
     return View(int(rng.integers(1 << 60)), counts, ids, T, _corners_px(lens, T))
 

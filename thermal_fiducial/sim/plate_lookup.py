@@ -29,10 +29,10 @@ class Strip:
         """The part of ``rows`` that lies in the strip."""
         return slice(max(rows.start, self.start), min(rows.stop, self.stop))
 
-    def rows_of(self, rows: slice) -> tuple[slice, slice]:
-        """The strip's part of ``rows``, extended by a row at each end if possible, and the part's place in it."""
+    def rows_of(self, rows: slice, margin: int) -> tuple[slice, slice]:
+        """The strip's part of ``rows``, extended by ``margin`` at each end if possible, and the part's place in it."""
         own = self.within(rows)
-        padded = slice(max(own.start - 1, rows.start), min(own.stop + 1, rows.stop))
+        padded = slice(max(own.start - margin, rows.start), min(own.stop + margin, rows.stop))
         return padded, slice(own.start - padded.start, own.stop - padded.start)
 
     def share(self, rows: slice) -> Float32Array:

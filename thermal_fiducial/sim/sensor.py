@@ -27,7 +27,8 @@ class Sensor:
     ----------
     lag : thermal time constant of the bolometers [s]
     readout : from the sampling of the first row to that of the last [s]; the stamp is that of the middle row
-    psf_sigma_px : standard deviation of the point spread of optics and pixel together [px]
+    psf_sigma_px : standard deviation of the point spread of the optics [px]; with the pixel's area, over which they
+        integrate, edges are blurred by sqrt(psf_sigma_px^2 + 1/12)
     netd : temporal noise [K]
     counts_per_kelvin, offset_counts : scale, and counts at ambient temperature
     drift_counts, drift_period : of the drift of the offset with the housing's temperature [counts], [s]
@@ -102,9 +103,8 @@ class Sensor:
 
     def counts(self, temperature: Float32Array, t: float, frame: int, seed: int) -> Counts:
         """14-bit counts (height, width) of the temperatures [K] of the bolometers at ``t`` [s]."""
-        kelvin = cv2.GaussianBlur(temperature, (0, 0), self.psf_sigma_px) if self.psf_sigma_px > 0 else temperature
         rng = np.random.default_rng([seed, 4, frame])
-        kelvin = kelvin + self._pattern(t, kelvin.shape, seed)
+        kelvin = temperature + self._pattern(t, temperature.shape, seed)
         if self.netd > 0:
             kelvin += rng.standard_normal(kelvin.shape, dtype=np.float32) * np.float32(self.netd)
         offset = self.offset_counts + self.drift_counts * float(np.sin(2 * np.pi * t / self.drift_period))

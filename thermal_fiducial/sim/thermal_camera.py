@@ -178,6 +178,7 @@ class ThermalCamera:
             scenario.sensor.lag,
             flight.quality,
             scenario.sensor.readout,
+            scenario.sensor.psf_sigma_px,
         )
         self._last: tuple[int, Counts] | None = None
 

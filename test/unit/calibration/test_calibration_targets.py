@@ -100,7 +100,8 @@ def test_unusable_boards(size):
 
 
 def test_command_calibrates_a_folder(tmp_path, capsys):
-    rng = np.random.default_rng(11)
+    # Views whose points are all within 0.021 px: one that fits 2.5 times worse than the median is left out.
+    rng = np.random.default_rng(12)
     for index in range(8):
         counts, _ = chessboard_view(rng, 8.0 if index % 2 else -8.0, index)
         cv2.imwrite(str(tmp_path / f'{index:02}.png'), counts)

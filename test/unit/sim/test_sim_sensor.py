@@ -16,15 +16,15 @@ FFC = replace(TINY.sensor, ffc_first=1.0, ffc_period=5.0, ffc_duration=0.3)
 
 def test_ideal_sensor_is_linear():
     ramp = np.tile(np.linspace(-5, 40, 160, dtype=np.float32), (128, 1))
-    counts = replace(IDEAL, psf_sigma_px=0.0).counts(ramp, 3.0, 0, 0)
+    counts = IDEAL.counts(ramp, 3.0, 0, 0)
     # Half a count of rounding.
     np.testing.assert_allclose(counts, ramp * 30.0 + 3600.0, atol=0.501)
     assert counts.dtype == np.uint16
 
 
 def test_saturates_at_14_bits():
-    hot = replace(IDEAL).counts(FLAT + 1000.0, 0.0, 0, 0)
-    cold = replace(IDEAL).counts(FLAT - 1000.0, 0.0, 0, 0)
+    hot = IDEAL.counts(FLAT + 1000.0, 0.0, 0, 0)
+    cold = IDEAL.counts(FLAT - 1000.0, 0.0, 0, 0)
     assert hot.min() == FULL_SCALE == 16383
     assert cold.max() == 0
 

@@ -118,18 +118,27 @@ def in_motion(seed):
     return list(render_frames('fast', seconds=20.0, seed=seed, start=440, stop=444))
 
 
-@pytest.mark.parametrize(('bent', 'allowed'), [(0.35, 0.023), (1.0, 0.021), (2.0, 0.027), (3.0, 0.055)])
-def test_what_a_display_does_to_motion_blur_is_undone(bent, allowed):
+@pytest.mark.parametrize(
+    ('bent', 'allowed', 'sure'), [(0.35, 0.021, 18), (1.0, 0.021, 18), (2.0, 0.026, 18), (3.0, 0.040, 14)]
+)
+def test_what_a_display_does_to_motion_blur_is_undone(bent, allowed, sure):
     """Black takes longer to give way to white than white to black, or the other way round."""
-    shapes = []
+    shapes, normalised, claims = [], [], []
     for seed in (5, 31, 2):
         frames = in_motion(seed)
         rows = last_rows(frames, lambda counts: displayed(counts, bent), 'fast')
         error = corners_px(rows) - np.stack([frames[-1].corners_px[marker_id] for marker_id in rows['id'].tolist()])
-        shapes.append(error - error.mean(axis=1, keepdims=True))
-    # 0.0213, 0.0200, 0.0247 and 0.0499 px when this was written; 0.0212, 0.0206, 0.0256 and 0.0518 where the contrast
-    # is linear but for a bowl. The six markers of a single frame have up to a third more, or less.
-    assert np.sqrt(np.mean(np.concatenate(shapes) ** 2)) < allowed
+        shape = error - error.mean(axis=1, keepdims=True)
+        normalised.append(np.einsum('nki,nkij,nkj->n', shape, np.linalg.inv(corner_covariances(rows)), shape) / 6.0)
+        shapes.append(shape)
+        claims.append(rows['sigma_px'])
+    # Of a power of 3 four of the 18 markers claim 0.16 to 0.5 px, as their black is nearly all below the first count:
+    # they are up to 0.20 px off. The others: 0.0191, 0.0192, 0.0236, 0.0368 px; of twice as many frames 0.017 to 0.032.
+    clear = np.concatenate(claims) < 0.15
+    assert clear.sum() >= sure
+    assert np.sqrt(np.mean(np.concatenate(shapes)[clear] ** 2)) < allowed
+    # 0.2 in the mean, 1.2 at worst of twice as many frames.
+    assert np.concatenate(normalised).max() < 1.3
 
 
 def test_raw_counts_are_claimed_better_than_a_display(frames):

@@ -10,7 +10,8 @@ import numpy as np
 from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked, TINY
 
 #: A corner by its four sides, an edge between two cells, and a corner of a partially visible marker by such edges
-#: [px]: the blur of the optics is not quite a Gaussian. Rendered frames without noise.
+#: [px]: the blur of the optics is not quite a Gaussian. Behind the diffraction of a perfect lens of f/1.0 to f/1.6,
+#: corners of markers of 45 and 80 px are 0.006 to 0.013 px off, without noise.
 OF_SIDES_PX = 0.010
 #: Part of that error that the four sides of a marker have in common [px].
 OF_ALL_SIDES_PX = 0.005
