@@ -52,6 +52,10 @@ class SystematicErrors:
     #: The most likely size of ``corner_px`` [px], which is the root of a mean: by it a marker's residuals are unusual.
     #: Enters weights of markers.
     likely_corner_px: float = 0.1
+    #: What an adjustment of the map has found of the aspect ratio's error, as a share of the declared one, and (K,)
+    #: joint draws of what it leaves, None before any. Corners are corrected by it before they enter anything.
+    aspect_found: float = 0.0
+    aspect_left: FloatArray | None = None
 
 
 #: 99.9 % quantile of chi square with eight degrees of freedom, of a view of a marker.

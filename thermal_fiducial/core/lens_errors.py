@@ -32,26 +32,43 @@ class LensErrors:
         )
         #: (..., I) factors of independent variables of variance one, for errors of 1 px
         self.modes: FloatArray = (columns[..., :, None] * rows[..., None, :]).reshape(*corners.shape[:-1], -1)
-        self._px, self._camera = errors.corner_px, camera
+        self._px, self._camera, self._aspect_left = errors.corner_px, camera, errors.aspect_left
         arms = corners - camera.principal_point
         #: (..., 2) by one standard deviation of the focal length, and of the aspect ratio [px]
         self.of_focal_length: FloatArray = errors.focal_length_std * arms
-        self._of_aspect: FloatArray = errors.aspect * camera.aspect_error * arms
+        self.of_aspect: FloatArray = of_aspect(corners, camera, errors)
+
+    @property
+    def aspect_draws(self) -> FloatArray:
+        """(K,) of the error of the aspect ratio."""
+        return np.asarray(self._variables[1][1])
 
     def covariance(self, gains: FloatArray) -> FloatArray:
         """Covariance (m, m) of what has derivatives ``gains`` (n, m, 2) [1/px] by the corners."""
         mixed = np.tensordot(self.modes.reshape(len(gains), -1), self._px * gains, axes=([0], [0]))
-        lengths = np.stack([self.of_focal_length.reshape(-1, 2), self._of_aspect.reshape(-1, 2)])
+        left = 1.0 if self._aspect_left is None else float(np.sqrt(np.mean(self._aspect_left**2)))
+        lengths = np.stack([self.of_focal_length.reshape(-1, 2), left * self.of_aspect.reshape(-1, 2)])
         of_lengths = np.tensordot(gains, lengths, axes=([0, 2], [1, 2]))
         return np.asarray(np.tensordot(mixed, mixed, axes=([0, 2], [0, 2])) + of_lengths @ of_lengths.T)
 
     def drawn(self, chosen: slice = slice(None)) -> FloatArray:
         """The errors (..., 2, k) [px] in the ``chosen`` ones of :data:`DRAWS` draws."""
-        seed = crc32(np.ascontiguousarray(self._camera.K).tobytes())
-        lens, (focal_length, aspect) = _variables(seed, self.modes.shape[-1])
+        lens, (focal_length, aspect) = self._variables
+        if self._aspect_left is not None:
+            aspect = self._aspect_left
         smooth = np.tensordot(self.modes, self._px * lens[..., chosen], axes=1)
         of_lengths = self.of_focal_length[..., None] * focal_length[chosen]
-        return np.asarray(smooth + of_lengths + self._of_aspect[..., None] * aspect[chosen])
+        return np.asarray(smooth + of_lengths + self.of_aspect[..., None] * aspect[chosen])
+
+    @property
+    def _variables(self) -> tuple[FloatArray, FloatArray]:
+        """Draws of the camera's variables."""
+        return _variables(crc32(np.ascontiguousarray(self._camera.K).tobytes()), self.modes.shape[-1])
+
+
+def of_aspect(corners: FloatArray, camera: Camera, errors: SystematicErrors) -> FloatArray:
+    """Errors (..., 2) [px] of corners (..., 2) by one standard deviation of the aspect ratio."""
+    return np.asarray(errors.aspect * camera.aspect_error * (corners - camera.principal_point))
 
 
 def _modes(places: FloatArray, size: int, length: float) -> FloatArray:

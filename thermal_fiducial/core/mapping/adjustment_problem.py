@@ -11,8 +11,9 @@ from thermal_fiducial.core.error_model import CHI2_OF_VIEW, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, linearise, retract, whitening
 from thermal_fiducial.core.geometry.rigid_fit import BEHIND_CHI2, robust
+from thermal_fiducial.core.lens_errors import of_aspect
 from thermal_fiducial.core.mapping.map_data import exact, gauge, MapMarker
-from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
+from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations, Vectors
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
 # Variance that is added to those of priors [m^2, rad^2]: no place is known better than to 0.1 mm and mrad.
@@ -107,18 +108,23 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Poses:
-    """Poses of all keyframes (F, 4, 4) and markers (M, 4, 4), and of the frame of the odometry (4, 4)."""
+    """Poses of all keyframes (F, 4, 4) and markers (M, 4, 4), and of the frame of the odometry (4, 4).
+
+    And the error of the aspect ratio (1,), in units of its standard deviation.
+    """
 
     T_map_camera: FloatArray
     T_map_marker: FloatArray
+    lens: FloatArray
     T_map_odometry: FloatArray = field(default_factory=lambda: np.eye(4))
 
-    def moved(self, frames: FloatArray, nodes: FloatArray) -> 'Poses':
-        """By steps (F, 6) of the keyframes, and (M + 1, 6) of the markers and, last, the odometry."""
+    def moved(self, step: Vectors) -> 'Poses':
+        """By steps (F, 6, 1) of the keyframes, (M + 1, 6, 1) of markers and, last, odometry, and (1, 1) of the lens."""
         return Poses(
-            retract(self.T_map_camera, frames),
-            retract(self.T_map_marker, nodes[:-1]),
-            retract(self.T_map_odometry, nodes[-1]),
+            retract(self.T_map_camera, step.frames[..., 0]),
+            retract(self.T_map_marker, step.nodes[:-1, :, 0]),
+            self.lens + step.common[:, 0],
+            retract(self.T_map_odometry, step.nodes[-1, :, 0]),
         )
 
 
@@ -135,12 +141,12 @@ class Linearised:
     J_marker: FloatArray
     J_odometry: FloatArray
     chi2: FloatArray
-    squared_px: FloatArray
     #: differences (F, 6) and (M, 6) from the state to the priors, and their chi squares (F,), (M,)
     camera_apart: FloatArray
     camera_chi2: FloatArray
     marker_apart: FloatArray
     marker_chi2: FloatArray
+    lens_information: float
 
     def weights(self, scale: float) -> FloatArray:
         """Robust weights (n,) of the views, for corners of ``scale`` times their variance."""
@@ -153,7 +159,11 @@ class Linearised:
     def cost(self, scale: float) -> float:
         """Robust sum of squares."""
         of_priors = robust(np.concatenate([self.camera_chi2, self.marker_chi2]), CHI2_OF_POSE)[0]
-        return float(np.sum(self.view_costs(scale)) + np.sum(of_priors))
+        return float(
+            np.sum(self.view_costs(scale))
+            + np.sum(of_priors)
+            + self.lens_information * self.state.lens @ self.state.lens
+        )
 
 
 @dataclass(frozen=True)
@@ -173,8 +183,14 @@ class MapProblem:
     camera: IntArray
     corners: FloatArray
     W: FloatArray
+    #: the calibration with the most views, whose aspect ratio is estimated: (n, 8, 1) whitened corners by one standard
+    #: deviation of it
+    lens: int
+    J_lens: FloatArray
     odometry: Priors
     known: Priors
+    #: of the prior of that error
+    lens_information: float = 1.0
 
     @classmethod
     def build(cls, snapshot: Snapshot) -> 'MapProblem | None':
@@ -187,8 +203,11 @@ class MapProblem:
         if np.all(held):
             return None
         T_map_marker = np.stack([m.T_map_marker for m in markers])
+        camera, W = snapshot.camera[frames][frame], whitening(snapshot.covariances[views])
+        lens = int(np.argmax(np.bincount(camera)))
+        J_lens = _lens(snapshot, lens, camera, snapshot.corners[views], W)
         return cls(
-            start=Poses(snapshot.T_map_camera[frames], T_map_marker),
+            start=Poses(snapshot.T_map_camera[frames], T_map_marker, np.zeros(J_lens.shape[-1])),
             ids=marker_ids.tolist(),
             stamps=snapshot.stamps_ns[frames].tolist(),
             sizes=np.array([m.size for m in markers]),
@@ -197,9 +216,11 @@ class MapProblem:
             cameras=snapshot.cameras,
             frame=frame,
             marker=marker,
-            camera=snapshot.camera[frames][frame],
+            camera=camera,
             corners=snapshot.corners[views],
-            W=whitening(snapshot.covariances[views]),
+            W=W,
+            lens=lens,
+            J_lens=J_lens,
             odometry=Priors(snapshot.odometry.T[frames], snapshot.odometry.information[frames]),
             known=_known(snapshot, marker_ids, T_map_marker),
         )
@@ -217,26 +238,30 @@ class MapProblem:
         # Markers behind the camera have no gradient, and the cost of an outlier.
         behind = ~np.all(np.isfinite(uv), axis=(1, 2))
         J_camera[behind], J_marker[behind] = 0.0, 0.0
-        residuals = np.where(behind[:, None, None], 0.0, self.corners - uv)
-        r = (self.W @ residuals[..., None]).reshape(n, 8)
+        r = (self.W @ (self.corners - uv)[..., None]).reshape(n, 8) - self.J_lens @ state.lens
+        r[behind] = 0.0
         chi2 = np.where(behind, BEHIND_CHI2, np.sum(r * r, axis=-1))
         J_camera, J_marker = ((self.W @ J.reshape(n, 4, 2, 6)).reshape(n, 8, 6) for J in (J_camera, J_marker))
-        squared_px = np.sum(residuals**2, axis=(1, 2))
         J_odometry = lever_arm(self.odometry.T[:, :3, 3] @ state.T_map_odometry[:3, :3].T)
         of_cameras = self.odometry.moved(state.T_map_odometry).apart(state.T_map_camera)
         of_markers = self.known.apart(state.T_map_marker)
-        return Linearised(state, r, J_camera, J_marker, J_odometry, chi2, squared_px, *of_cameras, *of_markers)
+        return Linearised(
+            state, r, J_camera, J_marker, J_odometry, chi2, *of_cameras, *of_markers, self.lens_information
+        )
+
+    def rms_px(self, now: Linearised) -> float:
+        """Rms re-projection error of all corners [px]."""
+        residuals = np.linalg.solve(self.W, now.r.reshape(*self.corners.shape, 1))
+        return float(np.sqrt(np.sum(residuals**2) / (4 * len(residuals))))
 
     def step(self, now: Linearised, scale: float, damping: float) -> Linearised | None:
         """After one damped Gauss-Newton step; None where the equations are singular."""
-        blocks, *sides = self.normal(now, scale)
+        blocks, sides = self.normal(now, scale)
         system = self.equations.reduced(blocks, damping)
         if system is None:
             return None
-        frames, nodes = (steps[..., 0] for steps in system.solve(*sides))
-        if not (np.all(np.isfinite(frames)) and np.all(np.isfinite(nodes))):
-            return None
-        return self.evaluate(now.state.moved(frames, nodes))
+        step = system.solve(sides)
+        return self.evaluate(now.state.moved(step)) if all(np.all(np.isfinite(part)) for part in step) else None
 
     def mirrored(self, state: Poses) -> Poses:
         """The state with each marker in about the other pose that its views allow: turned by 180 deg about them."""
@@ -250,9 +275,9 @@ class MapProblem:
 
     def markers_stepped(self, now: Linearised, scale: float) -> Poses:
         """After one Gauss-Newton step of each marker alone."""
-        blocks, _, side = self.normal(now, scale)
+        blocks, sides = self.normal(now, scale)
         largest = np.max(blocks.node, axis=(1, 2), keepdims=True)
-        steps = np.linalg.solve(blocks.node + (TINY * largest + TINY) * np.eye(6), side)
+        steps = np.linalg.solve(blocks.node + (TINY * largest + TINY) * np.eye(6), sides.nodes)
         return replace(now.state, T_map_marker=retract(now.state.T_map_marker, steps[:-1, :, 0]))
 
     @cached_property
@@ -267,25 +292,30 @@ class MapProblem:
         node = np.concatenate([self.marker, np.full(len(keyframes), len(self.ids))])
         return NormalEquations(frame, node, np.append(self.held, False))
 
-    def normal(self, now: Linearised, scale: float) -> tuple[Blocks, FloatArray, FloatArray]:
-        """Normal equations, and their right sides (F, 6, 1) and (M + 1, 6, 1)."""
+    def normal(self, now: Linearised, scale: float) -> tuple[Blocks, Vectors]:
+        """Normal equations, and their right sides."""
         weights = now.weights(scale)[:, None, None]
         of_camera, of_marker = (weights * np.swapaxes(J, -1, -2) for J in (now.J_camera, now.J_marker))
         odometry, known = self.odometry.weighted(now.camera_chi2), self.known.weighted(now.marker_chi2)
         of_camera_by_odometry = odometry @ now.J_odometry
         of_odometry = np.swapaxes(now.J_odometry, -1, -2) @ of_camera_by_odometry
+        lens, count = (np.sqrt(weights) * self.J_lens).reshape(-1, self.J_lens.shape[-1]), self.J_lens.shape[-1]
         blocks = Blocks(
             frame=self.over_frames(of_camera @ now.J_camera) + odometry,
             node=_with_odometry(self.over_markers(of_marker @ now.J_marker) + known, of_odometry),
             cross=np.concatenate([of_camera @ now.J_marker, -of_camera_by_odometry]),
+            common=Vectors(
+                self.over_frames(of_camera @ self.J_lens),
+                _with_odometry(self.over_markers(of_marker @ self.J_lens), np.zeros((1, 6, count))),
+                lens.T @ lens + self.lens_information * np.eye(count),
+            ),
         )
         of_priors = odometry @ now.camera_apart[..., None], known @ now.marker_apart[..., None]
-        return blocks, *self.sides(now, weights * now.r[..., None], *of_priors)
+        sides = self.sides(now, weights * now.r[..., None], *of_priors)
+        return blocks, sides._replace(common=sides.common - self.lens_information * now.state.lens[:, None])
 
-    def sides(
-        self, now: Linearised, of_views: FloatArray, of_odometry: FloatArray, of_known: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Right sides (F, 6, k) and (M + 1, 6, k) of the normal equations.
+    def sides(self, now: Linearised, of_views: FloatArray, of_odometry: FloatArray, of_known: FloatArray) -> Vectors:
+        """Right sides of the normal equations, without the priors of the lens.
 
         Parameters
         ----------
@@ -294,7 +324,11 @@ class MapProblem:
         """
         of_frames, of_markers = (np.swapaxes(J, -1, -2) @ of_views for J in (now.J_camera, now.J_marker))
         back = -np.swapaxes(now.J_odometry, -1, -2) @ of_odometry
-        return self.over_frames(of_frames) + of_odometry, _with_odometry(self.over_markers(of_markers) + of_known, back)
+        return Vectors(
+            self.over_frames(of_frames) + of_odometry,
+            _with_odometry(self.over_markers(of_markers) + of_known, back),
+            np.tensordot(self.J_lens, of_views, axes=([0, 1], [0, 1])),
+        )
 
     def over_frames(self, values: FloatArray) -> FloatArray:
         """Sums (F, ...) of values (n, ...) of the views over those of each keyframe."""
@@ -310,6 +344,12 @@ class MapProblem:
 def _with_odometry(of_markers: FloatArray, of_frames: FloatArray) -> FloatArray:
     """Those of M markers (M, ...), and last the sum over the keyframes (F, ...): (M + 1, ...)."""
     return np.concatenate([of_markers, np.sum(of_frames, axis=0, keepdims=True)])
+
+
+def _lens(snapshot: Snapshot, lens: int, camera: IntArray, corners: FloatArray, W: FloatArray) -> FloatArray:
+    """Whitened corners (n, 4, 2) of n views by one standard deviation of the aspect ratio of one lens, (n, 8, 1)."""
+    J = W @ of_aspect(corners, snapshot.cameras[lens], snapshot.errors)[..., None]
+    return np.where((camera == lens)[:, None, None], J.reshape(len(J), 8, 1), 0.0)
 
 
 def _known(snapshot: Snapshot, ids: IntArray, T_map_marker: FloatArray) -> Priors:

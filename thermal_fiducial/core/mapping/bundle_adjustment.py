@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.core.error_model import noise_factor
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Snapshot
 from thermal_fiducial.core.mapping.candidates import UNAMBIGUOUS
@@ -36,6 +37,17 @@ _FEWEST, _LEAST, _EXPLAINED = 10, 0.1, 0.8
 
 
 @dataclass(frozen=True)
+class FoundAspect:
+    """What an adjustment has found of the error of the aspect ratio of the pixels."""
+
+    #: the calibration that has this error
+    camera: Camera
+    #: as a share of the declared one, and (K,) draws of what is left of it
+    share: float
+    left: FloatArray
+
+
+@dataclass(frozen=True)
 class AdjustedMap:
     """Result of a bundle adjustment."""
 
@@ -50,6 +62,7 @@ class AdjustedMap:
     #: adjusted markers that were moved or duplicated, by ID: the share of its views that are outliers
     inconsistent: dict[int, float]
     map_revision: int
+    aspect: FoundAspect
 
 
 def refine(snapshot: Snapshot) -> AdjustedMap | None:
@@ -59,7 +72,43 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
         return None
     now = _minimise(problem, problem.evaluate(problem.start))
     mirrored = _with_mirrored(problem, now)
-    return _result(problem, snapshot, now if mirrored is None else _minimise(problem, mirrored))
+    now = now if mirrored is None else _minimise(problem, mirrored)
+    if problem.J_lens.any():
+        problem = _weighed(problem, snapshot, now) or problem
+        # The map follows the aspect ratio linearly, by far less than a step of a minimisation: one is enough.
+        now = problem.step(problem.evaluate(now.state), _scale(now.chi2), TINY) or now
+    return _result(problem, snapshot, now)
+
+
+def _sources(problem: MapProblem, now: Linearised) -> tuple[float, ErrorSources | None]:
+    """The factor of all variances by the residuals, and the errors, priors divided by that factor."""
+    scale = _scale(now.chi2)
+    weights = now.weights(scale)
+    full = weights == 1.0
+    unknowns = 6 * (len(problem.stamps) + np.count_nonzero(~problem.held))
+    widened = noise_factor(float(np.sum(now.chi2[full])), int(8 * np.count_nonzero(full) - unknowns))
+    # What corners are off beyond their claim says nothing of priors: these keep theirs.
+    problem = replace(problem, odometry=problem.odometry.divided(widened), known=problem.known.divided(widened))
+    system = problem.equations.reduced(problem.normal(now, scale)[0])
+    if system is None:
+        return widened, None
+    return widened, ErrorSources(problem, system, now, weights, np.random.default_rng(0))
+
+
+def _weighed(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> MapProblem | None:
+    """The problem with that information of the aspect ratio's prior by which the estimate is nearest to the error.
+
+    The smooth error of the lens and the markers' shapes look like one, too. So the information is not one, but what the
+    joint draws of all of them say.
+    """
+    widened, sources = _sources(problem, now)
+    if sources is None:
+        return None
+    estimated = sources.of_aspect(widened, snapshot.errors)
+    shown = 1.0 / sources.system.covariance[0, 0] - problem.lens_information
+    gain = shown / (shown + problem.lens_information)
+    best = min(gain**2 / max(float(np.mean(estimated**2)), TINY), 1.0 - TINY)
+    return replace(problem, lens_information=shown * (1.0 / best - 1.0)) if best > TINY else problem
 
 
 def _minimise(problem: MapProblem, now: Linearised) -> Linearised:
@@ -104,19 +153,12 @@ def _scale(chi2: FloatArray) -> float:
 
 def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> AdjustedMap | None:
     """The outcome with its covariances; None where these do not exist."""
-    scale = _scale(now.chi2)
-    weights = now.weights(scale)
-    full = weights == 1.0
-    unknowns = 6 * (len(problem.stamps) + np.count_nonzero(~problem.held))
-    widened = noise_factor(float(np.sum(now.chi2[full])), int(8 * np.count_nonzero(full) - unknowns))
-    # What corners are off beyond their claim says nothing of priors: these keep theirs.
-    problem = replace(problem, odometry=problem.odometry.divided(widened), known=problem.known.divided(widened))
-    system = problem.equations.reduced(problem.normal(now, scale)[0])
-    if system is None:
+    widened, sources = _sources(problem, now)
+    if sources is None:
         return None
+    full = sources.weights == 1.0
     known = np.stack([snapshot.markers[key].draws for key in problem.ids])
-    sources = ErrorSources(problem, system, now, weights, np.random.default_rng(0))
-    covariances, draws = sources.of_markers(widened, snapshot.errors, known)
+    covariances, draws, left = sources.of_markers(widened, snapshot.errors, known)
     if not np.all(np.isfinite(covariances)):
         return None
     markers, inconsistent = {}, {}
@@ -134,10 +176,11 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
     return AdjustedMap(
         markers,
         dict(zip(problem.stamps, now.state.T_map_camera, strict=True)),
-        float(np.sqrt(np.sum(now.squared_px) / (4 * len(problem.frame)))),
-        now.cost(scale) / widened,
+        problem.rms_px(now),
+        now.cost(_scale(now.chi2)) / widened,
         inconsistent,
         snapshot.map_revision,
+        FoundAspect(problem.cameras[problem.lens], float(now.state.lens[0]), left),
     )
 
 

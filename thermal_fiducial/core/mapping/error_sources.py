@@ -6,6 +6,7 @@ of all markers together do: the error of a pose by several markers is its deriva
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,13 +21,24 @@ from thermal_fiducial.core.error_model import (
 )
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem
-from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
+from thermal_fiducial.core.mapping.normal_equations import BorderedSystem, Vectors
 from thermal_fiducial.core.types import FloatArray
 
-#: Right sides (F, 6, k) and (M + 1, 6, k) of the normal equations.
-RightSides = tuple[FloatArray, FloatArray]
 #: Draws that are propagated at a time, which bounds the memory.
 _AT_ONCE = 32
+_SOME_DRAWS = [slice(first, first + _AT_ONCE) for first in range(0, DRAWS, _AT_ONCE)]
+#: Right sides of the normal equations for some of the draws.
+DrawnSides = Callable[[slice], Vectors]
+
+
+class MapErrors(NamedTuple):
+    """Errors of M adjusted markers, and of the lens."""
+
+    #: (M, 6, 6), and (M, 6, K) joint draws of all but the scale's
+    covariances: FloatArray
+    draws: FloatArray
+    #: (K,) draws of what is left of the aspect ratio's error, as a share of the declared one
+    aspect_left: FloatArray
 
 
 @dataclass(frozen=True)
@@ -34,44 +46,54 @@ class ErrorSources:
     """Errors of the M markers of an adjustment by those of what it was made from."""
 
     problem: MapProblem
-    system: ReducedSystem
+    system: BorderedSystem
     now: Linearised
     #: (n,) robust weights of the views
     weights: FloatArray
     rng: np.random.Generator
 
-    def of_markers(self, widened: float, errors: SystematicErrors, known: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Covariances (M, 6, 6) of the markers, and joint draws (M, 6, K) of their errors but for the scale.
+    def of_markers(self, widened: float, errors: SystematicErrors, known: FloatArray) -> MapErrors:
+        """Errors of the markers, and what is left of the aspect ratio's.
 
         Parameters
         ----------
         widened : factor of all variances; covariances of priors come divided by it
         known : (M, 6, K) draws of the held markers; others are not used
         """
-        of_odometry = np.zeros_like(known[:1])
-        lasting, of_held = self._lasting(errors), self.system.by_held(np.concatenate([known, of_odometry]))[:-1]
-        positions = self.now.state.T_map_marker[:, :3, 3]
-        covariances = (
-            widened * self.system.covariances()[:-1] + covariance_by_draws(lasting) + covariance_by_draws(of_held)
-        )
-        covariances += scale_of_map(arms_of_scale(positions, positions[self.problem.anchors]), errors)
-        return covariances, lasting + self._noise(widened) + of_held
+        system, problem, positions = self.system, self.problem, self.now.state.T_map_marker[:, :3, 3]
+        by_corners, by_noise = self._solved(self._lasting(errors)), self._solved(self._noise(widened))
+        by_held = system.by_held(np.concatenate([known, np.zeros_like(known[:1])]))
+        # By noise alone: the error of the aspect ratio is among the lasting ones.
+        noise_of_common = system.covariance - problem.lens_information * system.covariance @ system.covariance
+        covariances = widened * system.covariances(noise_of_common)[:-1]
+        covariances += covariance_by_draws(by_corners.nodes[:-1]) + covariance_by_draws(by_held.nodes[:-1])
+        covariances += scale_of_map(arms_of_scale(positions, positions[problem.anchors]), errors)
+        nodes = by_corners.nodes + by_noise.nodes + by_held.nodes
+        common = by_corners.common + by_noise.common + by_held.common
+        lens = LensErrors(problem.corners[:1], problem.cameras[problem.lens], errors)
+        return MapErrors(covariances, nodes[:-1], lens.aspect_draws - common[0])
 
-    def _noise(self, widened: float) -> FloatArray:
-        """(M, 6, K) by noise of corners and priors."""
+    def of_aspect(self, widened: float, errors: SystematicErrors) -> FloatArray:
+        """Some draws of what is estimated of the aspect ratio's error, by itself, noise and all other errors."""
+        some = _SOME_DRAWS[0]
+        of_all = (self.system.common(sides(some))[0] for sides in (self._lasting(errors), self._noise(widened)))
+        return np.asarray(sum(of_all))
+
+    def _noise(self, widened: float) -> DrawnSides:
+        """Of noise of corners and priors."""
         problem, roots = self.problem, np.sqrt(widened * self.weights)[:, None, None]
         of_frame = np.sqrt(widened) * covariance_root(problem.odometry.weighted(self.now.camera_chi2))
         of_marker = np.sqrt(widened) * covariance_root(problem.known.weighted(self.now.marker_chi2))
 
-        def sides(_: slice) -> RightSides:
+        def sides(_: slice) -> Vectors:
             of_views = roots * self._normal(len(roots), 8)
             of_odometry = of_frame @ self._normal(len(of_frame), 6)
             return problem.sides(self.now, of_views, of_odometry, of_marker @ self._normal(len(of_marker), 6))
 
-        return self._solved(sides)
+        return sides
 
-    def _lasting(self, errors: SystematicErrors) -> FloatArray:
-        """(M, 6, K) by corner errors that are the same in all views of a marker, and by those of the lens.
+    def _lasting(self, errors: SystematicErrors) -> DrawnSides:
+        """Of corner errors that are the same in all views of a marker, and by those of the lens.
 
         They do not average out and leave no residuals: the shape of a fixed marker rotates the whole map, and a lens
         that is wrong bends it.
@@ -85,19 +107,19 @@ class ErrorSources:
 
         no_priors = [np.zeros((number, 6, _AT_ONCE)) for number in (len(problem.stamps), len(problem.ids))]
 
-        def sides(chosen: slice) -> RightSides:
+        def sides(chosen: slice) -> Vectors:
             off = (shapes * self._normal(len(shapes), 4, 2))[problem.marker]
             for own, lens in zip(views, lenses, strict=True):
                 off[own] += lens.drawn(chosen)
             of_views = weights * (problem.W @ off).reshape(-1, 8, _AT_ONCE)
             return problem.sides(self.now, of_views, *no_priors)
 
-        return self._solved(sides)
+        return sides
 
-    def _solved(self, sides: Callable[[slice], RightSides]) -> FloatArray:
-        """Errors (M, 6, K) by right sides of the normal equations, which come for some of the draws at a time."""
-        chosen = (slice(first, first + _AT_ONCE) for first in range(0, DRAWS, _AT_ONCE))
-        return np.concatenate([self.system.solve(*sides(some))[1][:-1] for some in chosen], axis=-1)
+    def _solved(self, sides: DrawnSides) -> Vectors:
+        """Errors of all unknowns."""
+        parts = zip(*(self.system.solve(sides(some)) for some in _SOME_DRAWS), strict=True)
+        return Vectors(*(np.concatenate(part, axis=-1) for part in parts))
 
     def _normal(self, *shape: int) -> FloatArray:
         return self.rng.standard_normal((*shape, _AT_ONCE))

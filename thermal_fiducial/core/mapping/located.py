@@ -193,7 +193,8 @@ class LocatedFrame:
 
     stamp_ns: int
     camera: Camera
-    #: all N markers, which of them (N,) are in the map, and these
+    #: all N markers as detected, and without what is known of the lens's error; which (N,) are in the map, and these
+    raw: Observations
     observed: Observations
     is_known: BoolArray
     known: Sight

@@ -17,8 +17,9 @@ from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import camera_in_body
+from thermal_fiducial.core.lens_errors import of_aspect
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
-from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
+from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, FoundAspect, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers
 from thermal_fiducial.core.mapping.consistency import Consistency, from_consistent_markers
 from thermal_fiducial.core.mapping.corner_bias import CornerBias
@@ -82,6 +83,7 @@ class MarkerMapper:
 
     def _begin(self, marker_map: MarkerMap) -> None:
         self._bias = CornerBias()
+        self._found: FoundAspect | None = None
         self._initial, self.map = marker_map.copy(), marker_map.with_assumed_draws(self.errors)
         self._new = NewMarkers(self.config.marker_size, size_overrides(self.config.marker_size_overrides))
         self._consistency = Consistency(self.map.markers)
@@ -117,7 +119,11 @@ class MarkerMapper:
 
     def locate(self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None) -> LocatedFrame:
         """First half of :meth:`process`, up to the pose, which can be published before the map is updated."""
-        observed = Observations.of(markers)
+        raw, errors = Observations.of(markers), self._errors_of(camera)
+        observed = raw
+        if errors.aspect_found:
+            off_px = errors.aspect_found * of_aspect(raw.corners, camera, errors)
+            observed = replace(raw, corners=raw.corners - off_px)
         # Step 2: known and new markers.
         is_known, known = self._in_map(observed)
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
@@ -126,13 +132,13 @@ class MarkerMapper:
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.sizes):
             odometry, last = (None, self._last_at(stamp_ns)) if predicted is None else (predicted.pose, None)
-            fit = partial(locate, stamp_ns, camera=camera, model=self.errors, odometry=odometry, last=last)
+            fit = partial(locate, stamp_ns, camera=camera, model=errors, odometry=odometry, last=last)
             outcome = from_consistent_markers(sight, camera, predicted, fit)
         elif len(known.sizes):
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
-        frame = LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome)
+        frame = LocatedFrame(stamp_ns, camera, raw, observed, is_known, known, predicted, outcome)
         return self._consistency.checked(frame)
 
     def _in_map(self, observed: Observations) -> tuple[BoolArray, Sight]:
@@ -162,6 +168,13 @@ class MarkerMapper:
             likely_corner_px=self._bias.likely_px,
         )
 
+    def _errors_of(self, camera: Camera) -> SystematicErrors:
+        """Those of frames of ``camera``."""
+        found = self._found
+        if found is None or not camera.matches(found.camera):
+            return self.errors
+        return replace(self.errors, aspect_found=found.share, aspect_left=found.left)
+
     def learn(self, frame: LocatedFrame) -> MapperResult:
         """Second half of :meth:`process`: updates errors, quarantine and new markers with the frame located last."""
         outcome, waiting = frame.outcome, Waiting()
@@ -186,7 +199,7 @@ class MarkerMapper:
             if not self.frozen:
                 for key, error in zip(ids, errors.tolist(), strict=True):
                     self.map.markers[key] = self.map.markers[key].observed(frame.stamp_ns, error)
-                self._keyframes.keep(frame.observed, outcome.pose, frame.camera, frame.predicted)
+                self._keyframes.keep(frame.raw, outcome.pose, frame.camera, frame.predicted)
                 if not frame.is_known.all():
                     placed, waiting = self._place_new(frame, outcome.viewpoint)
                     changed |= placed
@@ -198,7 +211,9 @@ class MarkerMapper:
 
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, Waiting]:
         """Add views to the candidates of new markers; whether any entered the map, and what the others wait for."""
-        placed, waiting = self._new.show(frame.stamp_ns, frame.new, frame.camera, viewpoint, self.errors)
+        placed, waiting = self._new.show(
+            frame.stamp_ns, frame.new, frame.camera, viewpoint, self._errors_of(frame.camera)
+        )
         self.map.markers |= {marker.id: marker for marker in placed}
         self.map.revision += bool(placed)
         if placed:
@@ -216,9 +231,9 @@ class MarkerMapper:
         showing = {key: frame for key, frame in self._doubtful.items() if np.isin(frame.observed.ids, placed).any()}
         for key, frame in showing.items():
             _, known = self._in_map(frame.observed)
-            outcome = locate(key, known.only(known.trusted), frame.camera, self.errors)
+            outcome = locate(key, known.only(known.trusted), frame.camera, self._errors_of(frame.camera))
             if isinstance(outcome, Location) and outcome.settled:
-                self._keyframes.settle(frame.observed, outcome.pose, frame.camera)
+                self._keyframes.settle(frame.raw, outcome.pose, frame.camera)
                 del self._doubtful[key]
 
     def _without_pose(self, frame: LocatedFrame, refusal: Refusal) -> tuple[bool, Waiting]:
@@ -233,7 +248,9 @@ class MarkerMapper:
             return False, {}
         # No known marker is in view: the camera pose is that of the odometry.
         first = not any(key in self._new.candidates for key in frame.new.ids.tolist())
-        return self._place_new(frame, self._keyframes.bridge(frame.new, frame.camera, predicted, first=first))
+        return self._place_new(
+            frame, self._keyframes.bridge(frame.raw.only(~frame.is_known), frame.camera, predicted, first=first)
+        )
 
     def refinement_due(self, stamp_ns: int) -> bool:
         """Whether there are enough new keyframes since the last bundle adjustment for another."""
@@ -275,6 +292,7 @@ class MarkerMapper:
         if self.frozen or refinement.map_revision < self._initial.revision:
             return False
         self.map.adjust(refinement.markers)
+        self._found = refinement.aspect
         self._consistency.flag(self.map.markers, refinement.inconsistent)
         self._new.move(self._keyframes.move(refinement.keyframes))
         self.resets += 1

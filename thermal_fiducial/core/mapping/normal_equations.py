@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,19 @@ _ENTRIES = _DENSE**2
 _FULL = 0.15
 
 
+class Vectors(NamedTuple):
+    """K vectors of all unknowns: (F, 6, K) of keyframes, (M, 6, K) of nodes, (L, K) of what views have in common."""
+
+    frames: FloatArray
+    nodes: FloatArray
+    common: FloatArray
+
+    def dot(self, other: 'Vectors') -> FloatArray:
+        """Products (L, K) with L ``other`` ones, over keyframes and nodes."""
+        over = ([0, 1], [0, 1])
+        return np.asarray(np.tensordot(other.frames, self.frames, over) + np.tensordot(other.nodes, self.nodes, over))
+
+
 @dataclass(frozen=True)
 class Blocks:
     """Gauss-Newton terms of n connections of M nodes with F keyframes: of markers by their views, and of odometry."""
@@ -27,6 +40,8 @@ class Blocks:
     node: FloatArray
     #: (n, 6, 6) J' J of each connection's keyframe with its node
     cross: FloatArray
+    #: of L unknowns that all views have in common: with keyframes, with nodes, and (L, L) with each other and the prior
+    common: Vectors
 
 
 class NormalEquations:
@@ -44,16 +59,16 @@ class NormalEquations:
         self._frames = int(self._frame[-1]) + 1
         self._starts = np.searchsorted(self._frame, np.arange(self._frames + 1))
 
-    def reduced(self, blocks: Blocks, damping: float = 0.0) -> 'ReducedSystem | None':
+    def reduced(self, blocks: Blocks, damping: float = 0.0) -> 'BorderedSystem | None':
         """The system of the nodes alone, factorised; None where it is singular."""
         try:
             root = np.linalg.inv(np.linalg.cholesky(_damped(blocks.frame, damping)))
             coupling, matrix = self._schur(root[self._frame] @ blocks.cross[self._order], _damped(blocks.node, damping))
             free = np.flatnonzero(np.repeat(~self._held, 6))
-            solve_free = _solver(matrix[free][:, free])
+            apart = ReducedSystem(root, coupling, matrix, _solver(matrix[free][:, free]), self._held)
+            return BorderedSystem.of(apart, blocks.common)
         except (RuntimeError, ValueError, np.linalg.LinAlgError):
             return None
-        return ReducedSystem(root, coupling, matrix, solve_free, self._held)
 
     def _schur(self, cross: FloatArray, own: FloatArray) -> tuple[Any, Any]:
         """Coupling (6 F, 6 M) of keyframes and nodes, and Schur complement (6 M, 6 M); sparse in large maps.
@@ -114,13 +129,56 @@ class ReducedSystem:
             result[some] = inverse[first + each, :, each]
         return 0.5 * (result + np.swapaxes(result, -1, -2))
 
-    def by_held(self, drawn: FloatArray) -> FloatArray:
-        """Errors (M, 6, K) of all nodes by those of the held ones, of ``drawn`` (M, 6, K)."""
-        free, result = ~self.held, np.where(self.held[:, None, None], drawn, 0.0)
+    def by_held(self, drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Errors (F, 6, K) and (M, 6, K) of all by those of the held nodes, of ``drawn`` (M, 6, K)."""
+        free, result, count = ~self.held, np.where(self.held[:, None, None], drawn, 0.0), drawn.shape[-1]
         if result.any():
-            moved = (self.matrix @ result.reshape(-1, result.shape[-1])).reshape(result.shape)
-            result[free] = -self.solve_free(moved[free].reshape(-1, result.shape[-1])).reshape(result[free].shape)
-        return np.asarray(result)
+            moved = (self.matrix @ result.reshape(-1, count)).reshape(result.shape)
+            result[free] = -self.solve_free(moved[free].reshape(-1, count)).reshape(result[free].shape)
+        frames = -(self.coupling @ result.reshape(-1, count)).reshape(-1, 6, count)
+        return np.swapaxes(self.root, -1, -2) @ frames, np.asarray(result)
+
+
+@dataclass(frozen=True)
+class BorderedSystem:
+    """A reduced system with unknowns that all views have in common, which are eliminated last."""
+
+    apart: ReducedSystem
+    #: their terms with keyframes, nodes and each other, and what a unit of each moves the others by
+    border: Vectors
+    moved: Vectors
+    #: (L, L) inverse of their Schur complement
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, apart: ReducedSystem, border: Vectors) -> 'BorderedSystem':
+        """LinAlgError if the whole is not positive definite."""
+        moved = Vectors(*apart.solve(border.frames, border.nodes), border.common)
+        schur = border.common - moved.dot(border)
+        root = np.linalg.inv(np.linalg.cholesky(0.5 * (schur + schur.T)))
+        return cls(apart, border, moved, root.T @ root)
+
+    def solve(self, sides: Vectors) -> Vectors:
+        """Solutions for right sides of the same shapes."""
+        return self._with_common(*self.apart.solve(sides.frames, sides.nodes), sides.common)
+
+    def common(self, sides: Vectors) -> FloatArray:
+        """The part (L, K) of :meth:`solve` that is of what is common: the equations are symmetric."""
+        return np.asarray(self.covariance @ (sides.common - sides.dot(self.moved)))
+
+    def covariances(self, of_common: FloatArray) -> FloatArray:
+        """Covariances (M, 6, 6) of the nodes, with that (L, L) of what is common."""
+        return self.apart.covariances() + self.moved.nodes @ of_common @ np.swapaxes(self.moved.nodes, -1, -2)
+
+    def by_held(self, drawn: FloatArray) -> Vectors:
+        """Errors of all by those of the held nodes, of ``drawn`` (M, 6, K)."""
+        return self._with_common(*self.apart.by_held(drawn), np.zeros((1, 1)))
+
+    def _with_common(self, frames: FloatArray, nodes: FloatArray, side: FloatArray) -> Vectors:
+        """Solutions by those (F, 6, K) and (M, 6, K) without common unknowns, and the right sides (L, K) of these."""
+        apart = Vectors(frames, nodes, side)
+        common = self.covariance @ (side - apart.dot(self.border))
+        return Vectors(frames - self.moved.frames @ common, nodes - self.moved.nodes @ common, common)
 
 
 def _damped(H: FloatArray, damping: float) -> FloatArray:

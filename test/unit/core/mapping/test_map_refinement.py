@@ -130,14 +130,16 @@ def test_the_schur_complement_answers_like_the_whole_system(fixed):
     free = np.repeat(np.concatenate([np.ones(F, dtype=bool), ~problem.held, [True]]), 6)
     expected = np.zeros(6 * (F + M + 1))
     expected[free] = np.linalg.solve(H[np.ix_(free, free)], g[free])
-    blocks, *sides = problem.normal(e, 1.0)
+    blocks, sides = problem.normal(e, 1.0)
     system = problem.equations.reduced(blocks)
-    frames, nodes = system.solve(*sides)
+    frames, nodes, of_lens = system.solve(sides)
+    # Pixels of this camera are square as calibrated.
+    assert not of_lens.any()
     # Two ways of solving one system of condition 1e8. Where one prior holds the map, or two the frame of the odometry,
     # what keeps blocks from being singular, 1e-12 of them, holds it too: by 1e-4 of a step of 4 mm.
     np.testing.assert_allclose(np.concatenate([frames.ravel(), nodes.ravel()]), expected, rtol=1e-5, atol=1e-6)
     inverse_H = np.linalg.inv(H[np.ix_(free, free)])
-    covariances = system.covariances()
+    covariances = system.covariances(system.covariance)
     for k, m in enumerate(np.flatnonzero(~problem.held)):
         own = slice(6 * (F + k), 6 * (F + k) + 6)
         # The same; absolute where an element is the small difference of large ones.

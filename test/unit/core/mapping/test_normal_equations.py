@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core.mapping import normal_equations
-from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
+from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations, Vectors
 
-FRAMES, MARKERS = 7, 5
+#: Unknowns of six each, and those that all have in common.
+FRAMES, MARKERS, COMMON = 7, 5, 2
+APART = 6 * (FRAMES + MARKERS)
 
 
 def system(seed, held):
@@ -16,21 +18,36 @@ def system(seed, held):
     frame = np.repeat(np.arange(FRAMES), [len(markers) for markers in shown])
     marker = np.concatenate(shown)
     J_frame, J_marker = rng.normal(size=(2, len(frame), 8, 6))
-    whole = np.zeros((6 * (FRAMES + MARKERS), 6 * (FRAMES + MARKERS)))
-    for f, m, of_frame, of_marker in zip(frame, marker, J_frame, J_marker, strict=True):
+    J_common = rng.normal(size=(len(frame), 8, COMMON))
+    whole = np.zeros((APART + COMMON, APART + COMMON))
+    for f, m, of_frame, of_marker, of_common in zip(frame, marker, J_frame, J_marker, J_common, strict=True):
         J = np.zeros((8, len(whole)))
+        J[:, APART:] = of_common
         J[:, 6 * f : 6 * f + 6] = of_frame
         J[:, 6 * (FRAMES + m) : 6 * (FRAMES + m) + 6] = of_marker
         whole += J.T @ J
     each = np.arange(FRAMES + MARKERS)
-    own = whole.reshape(len(each), 6, len(each), 6)[each, :, each]
-    blocks = Blocks(own[:FRAMES], own[FRAMES:], np.swapaxes(J_frame, 1, 2) @ J_marker)
+    own = whole[:APART, :APART].reshape(len(each), 6, len(each), 6)[each, :, each]
+    blocks = Blocks(own[:FRAMES], own[FRAMES:], np.swapaxes(J_frame, 1, 2) @ J_marker, parts(whole[:, APART:]))
     return NormalEquations(frame, marker, held), blocks, whole
 
 
+def parts(vectors):
+    """Vectors (n, K) of all unknowns, by their kinds."""
+    count = vectors.shape[1]
+    frames, nodes, common = np.split(vectors, [6 * FRAMES, APART])
+    return Vectors(frames.reshape(-1, 6, count), nodes.reshape(-1, 6, count), common)
+
+
+def joined(vectors):
+    """The reverse of :func:`parts`."""
+    return np.concatenate([part.reshape(-1, part.shape[-1]) for part in vectors])
+
+
 def unknowns(held):
-    """Which rows of the system in one piece are those of keyframes and free markers."""
-    return np.flatnonzero(np.repeat(np.concatenate([np.ones(FRAMES, dtype=bool), ~held]), 6))
+    """Which rows of the system in one piece are those of keyframes, free markers, and what is common."""
+    apart = np.repeat(np.concatenate([np.ones(FRAMES, dtype=bool), ~held]), 6)
+    return np.flatnonzero(np.concatenate([apart, np.ones(COMMON, dtype=bool)]))
 
 
 def only(*markers):
@@ -55,13 +72,14 @@ def way(request, monkeypatch):
 def test_the_solution_is_that_of_the_system_in_one_piece(held):
     equations, blocks, whole = system(1, held)
     rng, free = np.random.default_rng(2), unknowns(held)
-    right = rng.normal(size=(FRAMES + MARKERS, 6, 2))
-    frames, markers = equations.reduced(blocks).solve(right[:FRAMES], right[FRAMES:])
-    expected = np.linalg.solve(whole[np.ix_(free, free)], right.reshape(-1, 2)[free])
-    found = np.concatenate([frames, markers]).reshape(-1, 2)
+    right = rng.normal(size=(APART + COMMON, 2))
+    solution = equations.reduced(blocks).solve(parts(right))
+    expected, found = np.linalg.solve(whole[np.ix_(free, free)], right[free]), joined(solution)
     # The ridge is 1e-12 of the largest entry; the condition of these systems is below a thousand.
     np.testing.assert_allclose(found[free], expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max())
-    assert not markers[held].any()
+    assert not solution.nodes[held].any()
+    alone = equations.reduced(blocks).common(parts(right))
+    np.testing.assert_allclose(alone, solution.common, rtol=1e-8, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.usefixtures('way')
@@ -70,22 +88,23 @@ def test_the_covariances_are_those_of_the_free_markers_in_the_inverse():
     equations, blocks, whole = system(3, held)
     free = unknowns(held)
     inverse = np.linalg.inv(whole[np.ix_(free, free)])
-    covariances = equations.reduced(blocks).covariances()
+    reduced = equations.reduced(blocks)
+    covariances = reduced.covariances(reduced.covariance)
     for place, marker in enumerate(np.flatnonzero(~held)):
         rows = slice(6 * (FRAMES + place), 6 * (FRAMES + place) + 6)
         np.testing.assert_allclose(covariances[marker], inverse[rows, rows], rtol=1e-8, atol=1e-12)
     assert not covariances[2].any()
 
 
-def test_damping_adds_to_the_diagonals_of_both():
+def test_damping_adds_to_the_diagonals_of_keyframes_and_markers():
     held = only(0)
     equations, blocks, whole = system(5, held)
     free = unknowns(held)
-    right = np.random.default_rng(6).normal(size=(FRAMES + MARKERS, 6, 1))
-    frames, markers = equations.reduced(blocks, damping=0.5).solve(right[:FRAMES], right[FRAMES:])
-    damped = (whole + 0.5 * np.diag(np.diag(whole)))[np.ix_(free, free)]
-    expected = np.linalg.solve(damped, right.reshape(-1, 1)[free])
-    found = np.concatenate([frames, markers]).reshape(-1, 1)[free]
+    right = np.random.default_rng(6).normal(size=(APART + COMMON, 1))
+    found = joined(equations.reduced(blocks, damping=0.5).solve(parts(right)))[free]
+    # What is common has a prior that keeps it in place.
+    added = 0.5 * np.diag(whole) * (np.arange(len(whole)) < APART)
+    expected = np.linalg.solve((whole + np.diag(added))[np.ix_(free, free)], right[free])
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
 
 
@@ -103,10 +122,11 @@ def test_the_others_follow_the_held_markers(held):
     equations, blocks, whole = system(4, held)
     drawn = np.random.default_rng(5).normal(size=(MARKERS, 6, 3))
     found = equations.reduced(blocks).by_held(drawn)
-    assert np.array_equal(found[held], drawn[held])
+    assert np.array_equal(found.nodes[held], drawn[held])
     free = unknowns(held)
-    moved = np.concatenate([np.zeros((FRAMES, 6, 3)), np.where(held[:, None, None], drawn, 0.0)]).reshape(-1, 3)
+    moved = np.zeros((APART + COMMON, 3))
+    moved[6 * FRAMES : APART] = np.where(held[:, None, None], drawn, 0.0).reshape(-1, 3)
     expected = moved.copy()
     expected[free] -= np.linalg.solve(whole[np.ix_(free, free)], (whole @ moved)[free])
     # As for the solutions above.
-    assert np.allclose(found.reshape(-1, 3), expected[6 * FRAMES :], rtol=0.0, atol=1e-7)
+    assert np.allclose(joined(found)[6 * FRAMES :], expected[6 * FRAMES :], rtol=0.0, atol=1e-7)
