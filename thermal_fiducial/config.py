@@ -273,8 +273,8 @@ def _camera_position(camera: str = 'the camera', needs: tuple[str, ...] = ()) ->
 
 def _clock_random_walk(needs: tuple[str, ...]) -> Any:
     return param(
-        5.0e-5,
-        "Random walk of the camera's clock, against the IMU's and a second camera's.",
+        3.0e-4,
+        "Random walk of the camera's clock, against the IMU's and a second camera's; the default allows for 50 ppm.",
         unit='s/sqrt(s)',
         minimum=0.0,
         maximum=0.1,
