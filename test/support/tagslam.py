@@ -11,9 +11,11 @@ import yaml
 from support.scenes import motion_prior
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.detection.detector import rows_from_corners
+from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform, transform_from_quaternion
+from thermal_fiducial.core.lens_errors import of_aspect
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
@@ -190,15 +192,19 @@ def _frame(recording, seen):
 
 
 def compare(recording, markers, refinement):
-    """Rms re-projection error [px] of our solution and of the reference over the same views, and their number."""
-    ours, theirs = [], []
+    """Rms re-projection error [px] of our solution and of the reference over the same views, and their number.
+
+    Ours with the aspect ratio of the pixels that it found, the reference with the one that it was given.
+    """
+    ours, theirs, found = [], [], refinement.aspect.share
     for stamp, T_map_camera in refinement.keyframes.items():
         for key, corners in recording.views[stamp]:
             if key in markers and key in recording.T_map_marker and stamp in recording.T_map_rig:
-                for errors, T_camera, T_marker in (
-                    (ours, T_map_camera, markers[key].T_map_marker),
-                    (theirs, recording.T_map_rig[stamp] @ recording.T_rig_camera, recording.T_map_marker[key]),
+                off_px = found * of_aspect(corners, recording.camera, SystematicErrors())
+                for errors, T_camera, T_marker, there in (
+                    (ours, T_map_camera, markers[key].T_map_marker, corners - off_px),
+                    (theirs, recording.T_map_rig[stamp] @ recording.T_rig_camera, recording.T_map_marker[key], corners),
                 ):
                     uv = reproject(recording.camera, T_camera, corners_in_map(T_marker, recording.sizes[key]))
-                    errors.append(np.sum((uv - corners) ** 2, axis=-1))
+                    errors.append(np.sum((uv - there) ** 2, axis=-1))
     return np.sqrt(np.mean(ours)), np.sqrt(np.mean(theirs)), len(ours)
