@@ -36,7 +36,7 @@ class LensErrors:
         arms = corners - camera.principal_point
         #: (..., 2) by one standard deviation of the focal length, and of the aspect ratio [px]
         self.of_focal_length: FloatArray = errors.focal_length_std * arms
-        self.of_aspect: FloatArray = of_aspect(corners, camera, errors)
+        self._of_aspect: FloatArray = of_aspect(corners, camera, errors)
 
     @property
     def aspect_draws(self) -> FloatArray:
@@ -47,7 +47,7 @@ class LensErrors:
         """Covariance (m, m) of what has derivatives ``gains`` (n, m, 2) [1/px] by the corners."""
         mixed = np.tensordot(self.modes.reshape(len(gains), -1), self._px * gains, axes=([0], [0]))
         left = 1.0 if self._aspect_left is None else float(np.sqrt(np.mean(self._aspect_left**2)))
-        lengths = np.stack([self.of_focal_length.reshape(-1, 2), left * self.of_aspect.reshape(-1, 2)])
+        lengths = np.stack([self.of_focal_length.reshape(-1, 2), left * self._of_aspect.reshape(-1, 2)])
         of_lengths = np.tensordot(gains, lengths, axes=([0, 2], [1, 2]))
         return np.asarray(np.tensordot(mixed, mixed, axes=([0, 2], [0, 2])) + of_lengths @ of_lengths.T)
 
@@ -58,7 +58,7 @@ class LensErrors:
             aspect = self._aspect_left
         smooth = np.tensordot(self.modes, self._px * lens[..., chosen], axes=1)
         of_lengths = self.of_focal_length[..., None] * focal_length[chosen]
-        return np.asarray(smooth + of_lengths + self.of_aspect[..., None] * aspect[chosen])
+        return np.asarray(smooth + of_lengths + self._of_aspect[..., None] * aspect[chosen])
 
     @property
     def _variables(self) -> tuple[FloatArray, FloatArray]:

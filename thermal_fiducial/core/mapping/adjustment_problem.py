@@ -146,7 +146,8 @@ class Linearised:
     camera_chi2: FloatArray
     marker_apart: FloatArray
     marker_chi2: FloatArray
-    lens_information: float
+    #: chi square of the prior of the aspect ratio's error
+    lens_chi2: float
 
     def weights(self, scale: float) -> FloatArray:
         """Robust weights (n,) of the views, for corners of ``scale`` times their variance."""
@@ -159,11 +160,7 @@ class Linearised:
     def cost(self, scale: float) -> float:
         """Robust sum of squares."""
         of_priors = robust(np.concatenate([self.camera_chi2, self.marker_chi2]), CHI2_OF_POSE)[0]
-        return float(
-            np.sum(self.view_costs(scale))
-            + np.sum(of_priors)
-            + self.lens_information * self.state.lens @ self.state.lens
-        )
+        return float(np.sum(self.view_costs(scale)) + np.sum(of_priors) + self.lens_chi2)
 
 
 @dataclass(frozen=True)
@@ -245,9 +242,8 @@ class MapProblem:
         J_odometry = lever_arm(self.odometry.T[:, :3, 3] @ state.T_map_odometry[:3, :3].T)
         of_cameras = self.odometry.moved(state.T_map_odometry).apart(state.T_map_camera)
         of_markers = self.known.apart(state.T_map_marker)
-        return Linearised(
-            state, r, J_camera, J_marker, J_odometry, chi2, *of_cameras, *of_markers, self.lens_information
-        )
+        of_lens = float(self.lens_information * state.lens @ state.lens)
+        return Linearised(state, r, J_camera, J_marker, J_odometry, chi2, *of_cameras, *of_markers, of_lens)
 
     def rms_px(self, now: Linearised) -> float:
         """Rms re-projection error of all corners [px]."""
@@ -299,7 +295,8 @@ class MapProblem:
         odometry, known = self.odometry.weighted(now.camera_chi2), self.known.weighted(now.marker_chi2)
         of_camera_by_odometry = odometry @ now.J_odometry
         of_odometry = np.swapaxes(now.J_odometry, -1, -2) @ of_camera_by_odometry
-        lens, count = (np.sqrt(weights) * self.J_lens).reshape(-1, self.J_lens.shape[-1]), self.J_lens.shape[-1]
+        count = self.J_lens.shape[-1]
+        lens = (np.sqrt(weights) * self.J_lens).reshape(-1, count)
         blocks = Blocks(
             frame=self.over_frames(of_camera @ now.J_camera) + odometry,
             node=_with_odometry(self.over_markers(of_marker @ now.J_marker) + known, of_odometry),

@@ -74,7 +74,7 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
     mirrored = _with_mirrored(problem, now)
     now = now if mirrored is None else _minimise(problem, mirrored)
     if problem.J_lens.any():
-        problem = _weighed(problem, snapshot, now) or problem
+        problem = _weighed(problem, snapshot, now)
         # The map follows the aspect ratio linearly, by far less than a step of a minimisation: one is enough.
         now = problem.step(problem.evaluate(now.state), _scale(now.chi2), TINY) or now
     return _result(problem, snapshot, now)
@@ -95,15 +95,15 @@ def _sources(problem: MapProblem, now: Linearised) -> tuple[float, ErrorSources 
     return widened, ErrorSources(problem, system, now, weights, np.random.default_rng(0))
 
 
-def _weighed(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> MapProblem | None:
+def _weighed(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> MapProblem:
     """The problem with that information of the aspect ratio's prior by which the estimate is nearest to the error.
 
     The smooth error of the lens and the markers' shapes look like one, too. So the information is not one, but what the
-    joint draws of all of them say.
+    joint draws of all of them say. It stays one where these do not exist.
     """
     widened, sources = _sources(problem, now)
     if sources is None:
-        return None
+        return problem
     estimated = sources.of_aspect(widened, snapshot.errors)
     shown = 1.0 / sources.system.covariance[0, 0] - problem.lens_information
     gain = shown / (shown + problem.lens_information)
