@@ -1,9 +1,11 @@
 """Markers so near that the image cuts them off, drawn from their geometry alone: nothing of the detector is used."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 
-from support.lens_planes import plane_points
+from support.lens_planes import on_plane, rays
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -27,23 +29,35 @@ def pose(size_px, u, v, tilt, size=0.3):
     return se3.transform(R, np.array([u, v, 1.0]) * size * 265.0 / size_px)
 
 
-def draw(camera, grid, T, size=0.3, samples=4, blur=BLUR, thickness=0.0):
-    """White's share (height, width) of a plate at T_camera_marker; ``grid`` has its cells, a white ring about it.
+#: Rows that are drawn at a time.
+STRIP = 32
+
+
+@cache
+def strips(model, samples):
+    """Rays of all samples of the camera of a model, in strips of rows: the lens is solved once."""
+    camera = CAMERAS[model]
+    u, v = ((np.arange(pixels * samples) + 0.5) / samples - 0.5 for pixels in (camera.width, camera.height))
+    return [rays(camera, u, rows) for rows in np.split(v, range(STRIP * samples, len(v), STRIP * samples))]
+
+
+def draw(model, grid, T, size=0.3, samples=4, blur=BLUR, thickness=0.0):
+    """White's share (height, width) of a plate at T_camera_marker, seen by the camera of a model of the lens.
+
+    ``grid`` has the cells of the plate, a white ring about it.
 
     White is what is seen through the holes of both its face and its back, ``thickness`` behind it.
     """
-    fine = (np.arange(camera.width * samples) + 0.5) / samples - 0.5
-    rows = (np.arange(camera.height * samples) + 0.5) / samples - 0.5
+    camera = CAMERAS[model]
     image = np.empty((camera.height, camera.width), dtype=np.float32)
-    # Strips of rows bound the lag tail.
-    for first in range(0, camera.height, 32):
-        v = rows[first * samples : (first + 32) * samples]
-        seen = cells_at(grid, size, *plane_points(camera, T, fine, v))
+    # Strips of rows stay in the cache of the processor.
+    for first, (a, b) in zip(range(0, camera.height, STRIP), strips(model, samples), strict=True):
+        seen = cells_at(grid, size, *on_plane(T, a, b))
         if thickness:
             back = T @ se3.transform(np.eye(3), [0.0, 0.0, -thickness])
-            seen = np.minimum(seen, cells_at(grid, size, *plane_points(camera, back, fine, v)))
-        shares = seen.reshape(len(v) // samples, samples, camera.width, samples)
-        image[first : first + 32] = shares.mean(axis=(1, 3))
+            seen = np.minimum(seen, cells_at(grid, size, *on_plane(back, a, b)))
+        shares = seen.reshape(-1, samples, camera.width, samples)
+        image[first : first + STRIP] = shares.mean(axis=(1, 3))
     return cv2.GaussianBlur(image, (0, 0), blur) if blur > 0.0 else image
 
 

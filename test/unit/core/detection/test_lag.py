@@ -1,5 +1,6 @@
 """Removal of the bolometers' lag."""
 
+from functools import cache
 import math
 
 import cv2
@@ -258,6 +259,7 @@ def test_a_saturated_pixel_without_its_lag_tail(now, then, later, known):
 BLUR_PX, MARKER = np.hypot(0.6, 12**-0.5), np.array([13])
 
 
+@cache
 def lagging(cell, lag_blur, beyond=0.0):
     """A decoder, a white image with a marker in cells of so many pixels in a lag of ``lag_blur`` [px], its corners.
 
@@ -270,9 +272,12 @@ def lagging(cell, lag_blur, beyond=0.0):
     scene = np.pad(pattern.astype(np.float32), place * fine, constant_values=beyond)
     # The response at some ages, evenly spread in what they weigh.
     ages = -np.log(1.0 - (np.arange(400) + 0.5) / 400)
-    seen = sum(moved(scene, fine * np.array(lag_blur) * age) for age in ages) / len(ages)
+    seen = np.zeros_like(scene)
+    for age in ages:
+        cv2.accumulate(moved(scene, fine * np.array(lag_blur) * age), seen)
+    sharp = seen / len(ages)
     size = scene.shape[0] // fine
-    image = cv2.resize(cv2.GaussianBlur(seen, (0, 0), 0.6 * fine), (size, size), interpolation=cv2.INTER_AREA)
+    image = cv2.resize(cv2.GaussianBlur(sharp, (0, 0), 0.6 * fine), (size, size), interpolation=cv2.INTER_AREA)
     first, last = place + cell - 0.5, place + 7 * cell - 0.5
     return decoder, image, np.array([[[first, first], [last, first], [last, last], [first, last]]])
 

@@ -43,7 +43,7 @@ LAG, INSTANTS = 0.010, 24
 
 @cache
 def drawn(model, view):
-    return draw(CAMERAS[model], plate(ID), pose(*VIEWS[view]))
+    return draw(model, plate(ID), pose(*VIEWS[view]))
 
 
 def look(image, camera, T_expected, noise, marker_id=ID, config=CONFIG, twist=STILL):
@@ -79,12 +79,13 @@ def test_corners_outside_the_image_are_found_without_noise(model, view):
     assert found.contrast[0] == pytest.approx(200.0, rel=0.03)
 
 
+@cache
 def turning(view, rate):
     """A marker seen with lag in a turn [rad/s], 1 for white; its pose and the twist."""
     T, turn = pose(*VIEWS[view]), np.array([rate, -rate, 0.0]) / np.sqrt(2.0)
     ages = -LAG * np.log1p(-(np.arange(INSTANTS) + 0.5) / INSTANTS)
     then = [se3.transform(se3.so3_exp(turn * age), np.zeros(3)) @ T for age in ages.tolist()]
-    image = np.mean([draw(CAMERAS['plumb_bob'], plate(ID), T_then) for T_then in then], axis=0)
+    image = np.mean([draw('plumb_bob', plate(ID), T_then) for T_then in then], axis=0)
     return image, T, Twist(np.concatenate([np.zeros(3), turn]), 1e-9 * np.eye(6))
 
 
@@ -122,7 +123,7 @@ def test_holes_in_a_thick_plate_are_smaller_seen_from_the_side(view):
     """Of a plate of 3 mm the camera sees the cut sides of holes: the farther from its axis, the more."""
     camera, T, thickness = CAMERAS['plumb_bob'], pose(*VIEWS[view]), 0.003
     true = camera.project(se3.apply(T, marker_corners(SIZE)))
-    image = 7000.0 + 200.0 * draw(camera, plate(ID), T, thickness=thickness)
+    image = 7000.0 + 200.0 * draw('plumb_bob', plate(ID), T, thickness=thickness)
     errors = []
     for declared in (0.0, thickness):
         config = replace(CONFIG, plate_thickness=declared)
@@ -191,7 +192,7 @@ def test_nothing_else_is_taken_for_the_expected_marker(kind):
     for name in VIEWS:
         T = pose(*VIEWS[name])
         for contrast in (4.0, 100.0):
-            shown = 0.0 if kind == 'noise' else contrast * draw(camera, clutter(kind, rng), T, samples=2)
+            shown = 0.0 if kind == 'noise' else contrast * draw('equidistant', clutter(kind, rng), T, samples=2)
             image = 7000.0 + shown + rng.normal(0.0, 1.5, (camera.height, camera.width))
             assert len(look(image, camera, disturbed(T, rng), 1.5)[0]) == 0
 
@@ -199,7 +200,7 @@ def test_nothing_else_is_taken_for_the_expected_marker(kind):
 def test_what_too_few_cells_show_is_not_published():
     """A strip of three cells at one side is that of many markers."""
     camera, T = CAMERAS['equidistant'], pose(200, -0.93, 0.0, (0.0, 0.0, 0.0))
-    image = 7000.0 + 200.0 * draw(camera, plate(ID), T, samples=2)
+    image = 7000.0 + 200.0 * draw('equidistant', plate(ID), T, samples=2)
     assert len(look(image, camera, T, 0.5)[0]) == 0
 
 

@@ -12,10 +12,11 @@ from thermal_fiducial.core.detection.prediction.frame import counts_of
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import marker_corners
 
-CAMERA, ID, CONTRAST, NOISE = CAMERAS['plumb_bob'], 7, 200.0, 8.0
+MODEL, ID, CONTRAST, NOISE = 'plumb_bob', 7, 200.0, 8.0
+CAMERA = CAMERAS[MODEL]
 CELLS, REACH = BITS.shape[2] + 2, 1.5
 T = pose(90, 0.05, -0.05, (0.3, -0.25, 0.4))
-IMAGE = 7000.0 + CONTRAST * draw(CAMERA, plate(ID), T, samples=8)
+IMAGE = 7000.0 + CONTRAST * draw(MODEL, plate(ID), T, samples=8)
 CORNERS = CAMERA.project(se3.apply(T, marker_corners(0.3)))
 
 
