@@ -8,6 +8,8 @@ import pytest
 from support.estimates import any_estimate, ELSEWHERE
 from support.flights import CAMERA_POSITION, config
 
+from thermal_fiducial.core.filter.belief import Hypothesis
+from thermal_fiducial.core.filter.hypotheses import weigh
 from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
 from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_that_stays, WHITE
 from thermal_fiducial.core.filter.state import (
@@ -352,6 +354,21 @@ def test_the_estimate_goes_on_in_the_map_of_better_markers(estimate, still):
     grown = prior.covariance[POSITION, POSITION] - begun.covariance[POSITION, POSITION]
     # To the least noise of a pose, 0.1 mm, beside 2 mm.
     assert grown.trace() == pytest.approx((to_robot @ left @ to_robot.T).trace(), rel=1e-2)
+
+
+def test_a_refused_pose_leaves_the_estimate_in_its_map(estimate, still):
+    """Its claim became that of the refused markers' map, and good poses in that one were refused for ever."""
+    T, R = estimate.state.T_map_body, 1e-6 * np.eye(6)
+    large = 0.04 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    begun = replace(known(estimate), pose_noise=PoseNoise.of(BodyPose(T, R, large)))
+    far = BodyPose(transform(np.eye(3), [3.0, 0.0, 0.0]) @ T, R, large / 400.0)
+    hypothesis = Hypothesis(begun, 0, estimate.stamp_ns, estimate.stamp_ns)
+    refusing, verdict = weigh(FULL, hypothesis, innovation_of(FULL, begun, far, still), 0)
+    assert verdict.refused
+    np.testing.assert_array_equal(refusing.estimate.pose_noise.of_map, large)
+    # One standard deviation of the large map's error off.
+    near = BodyPose(transform(np.eye(3), [0.2, 0.0, 0.0]) @ T, R, large / 400.0)
+    assert weigh(FULL, refusing, innovation_of(FULL, refusing.estimate, near, still), 1)[1].accepted
 
 
 def test_worse_markers_take_nothing_away_from_what_is_known(estimate, still):
