@@ -79,17 +79,17 @@ def refine(
     known = width, 1.25 * spread / np.sqrt(np.sum(found)), blur_px
     log_blur = _plane(nodes[found], alone.log_blur[found], nodes)
     shared = Shared(log_blur, np.full(len(nodes), width))
-    pixels = _next_starts(nodes, pixels, alone.pixels, first.some, grid)
+    pixels = _next_starts(nodes, pixels, alone.pixels, first.some, grid, ROUGHLY)
     alike = _round(image, nodes, pixels, appearance, every, grid, shared, None)
     if np.sum(np.isfinite(alike.contrast)) < _LEAST_POINTS:
         return Refined(lost, *known)
-    pixels = _next_starts(nodes, pixels, alike.pixels, every, grid)
+    pixels = _next_starts(nodes, pixels, alike.pixels, every, grid, CLOSELY)
     contrast = _Contrast(alike.contrast, np.ones_like(grid) if typical is None else typical)
     refined = _round(image, nodes, pixels, appearance, every, grid, shared, contrast)
     noise = float(np.sqrt(np.nanmedian(refined.variance))) if np.any(np.isfinite(refined.variance)) else 0.0
     odd = np.flatnonzero(refined.variance > _ODD * noise**2)
     if len(odd):
-        starts = _next_starts(nodes, pixels, _without(refined.pixels, odd), every, grid)
+        starts = _next_starts(nodes, pixels, _without(refined.pixels, odd), every, grid, CLOSELY)
         again = _round(image, nodes, starts, appearance, odd, grid, shared, contrast, noise)
         for values, new in zip(refined, again, strict=True):
             values[odd] = new[odd]
@@ -149,13 +149,22 @@ def _sampled(
 
 
 def _next_starts(
-    nodes: FloatArray, starts: FloatArray, refined: FloatArray, fitted: IntArray, grid: BoolArray
+    nodes: FloatArray,
+    starts: FloatArray,
+    refined: FloatArray,
+    fitted: IntArray,
+    grid: BoolArray,
+    ridge: float,
 ) -> FloatArray:
-    """Starts (N, 2) of the next round; ``fitted`` points that were lost start at the grid's prediction."""
+    """Starts (N, 2) of the next round; ``fitted`` points that were lost start at the grid's prediction.
+
+    Once all points have been fitted, they show the curvature of the grid, by perspective and lens. Without it, outer
+    corners are predicted up to 2 px off; fits that start there take the edges for what deviates.
+    """
     starts = np.where(np.isfinite(refined), refined, starts)
     lost = fitted[np.isnan(refined[fitted, 0])]
     others = np.setdiff1d(np.flatnonzero(grid), lost)
-    surfaces = local_surfaces(nodes[others], starts[others], nodes[lost])
+    surfaces = local_surfaces(nodes[others], starts[others], nodes[lost], ridge)
     starts[lost[surfaces.determined]] = surfaces.centres[surfaces.determined]
     return starts
 

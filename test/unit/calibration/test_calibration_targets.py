@@ -27,7 +27,10 @@ CIRCLES = CircleGrid(4, 11, 0.03, 0.024)
 
 
 def chessboard_view(rng, contrast, seed, lens=LENS):
-    T = random_view(lens, CHESSBOARD.points, rng)
+    return seen_from(random_view(lens, CHESSBOARD.points, rng), contrast, seed, lens)
+
+
+def seen_from(T, contrast, seed, lens=LENS):
     plate = plate_pose(T, np.array([3.5, 2.5]) * SQUARE)
     counts = render(lens, plate, chessboard_levels(8, 6), 11 * SQUARE, 9 * SQUARE, contrast, seed)
     return counts, lens.project(se3.apply(T, CHESSBOARD.points))
@@ -50,6 +53,17 @@ def test_chessboard_of_either_polarity(contrast, views):
     rms = np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1)))
     # Measured 0.017 px at 8 K; noise grows as contrast falls.
     assert rms < 0.03 * 8.0 / min(8.0, abs(contrast) * 1.6)
+
+
+def test_outer_corners_are_as_good_as_inner_ones():
+    rng = np.random.default_rng(11)
+    views = [random_view(LENS, CHESSBOARD.points, rng) for _ in range(8)]
+    for index in (2, 7):
+        counts, truth = seen_from(views[index], 8.0 if index % 2 else -8.0, index)
+        error = smallest_error(CHESSBOARD.find(counts, GUESS).pixels, truth)
+        # 0.010 and 0.015 px at worst. Where what fits badly starts at a prediction that takes the grid for nearly even,
+        # an outer corner is 0.14 and 0.25 px off.
+        assert np.linalg.norm(error, axis=1).max() < 0.02
 
 
 def test_chessboard_beside_something_hot():
@@ -100,8 +114,7 @@ def test_unusable_boards(size):
 
 
 def test_command_calibrates_a_folder(tmp_path, capsys):
-    # Views whose points are all within 0.021 px: one that fits 2.5 times worse than the median is left out.
-    rng = np.random.default_rng(12)
+    rng = np.random.default_rng(11)
     for index in range(8):
         counts, _ = chessboard_view(rng, 8.0 if index % 2 else -8.0, index)
         cv2.imwrite(str(tmp_path / f'{index:02}.png'), counts)
