@@ -30,7 +30,8 @@ class Bolometer:
 
     def __init__(self, rig: Rig, room: Room, path: Path) -> None:
         self._rig, self._path, self._sensor = rig, path, rig.sensor
-        self._renderer = Renderer(rig.lens, room)
+        # The pixel's area blurs, too.
+        self._renderer = Renderer(rig.lens, room, np.sqrt(rig.sensor.blur**2 - 1.0 / 12.0))
         self._rng = rig.rng('bolometer')
         self._shape = rig.lens.height, rig.lens.width
         self._pattern = np.zeros(self._shape)
@@ -81,14 +82,11 @@ class Bolometer:
 
     def _counts(self, t: float, state: np.ndarray) -> np.ndarray:
         sensor, rng = self._sensor, self._rng
-        # The average over a pixel is in the picture already.
-        spread = np.sqrt(sensor.blur**2 - 1.0 / 12.0)
-        blurred = cv2.GaussianBlur(state, (0, 0), spread)
         if sensor.closes <= t < sensor.closes + sensor.closed:
             self._pattern *= _CORRECTED
         pixels, columns = sensor.pattern / np.sqrt(sensor.rate)
         self._pattern += rng.normal(0.0, pixels, self._shape) + rng.normal(0.0, columns, self._shape[1])
-        kelvin = blurred + self._pattern + rng.normal(0.0, sensor.noise, self._shape)
+        kelvin = state + self._pattern + rng.normal(0.0, sensor.noise, self._shape)
         counts = self._base + kelvin / sensor.count
         np.add.at(counts, self._stuck, self._off)
         return np.clip(np.round(counts), 0, FULL_SCALE).astype(np.uint16)

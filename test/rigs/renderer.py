@@ -1,4 +1,10 @@
-"""The image that the lens forms of a room, without blur and noise: rays met with planes, averaged over each pixel."""
+"""The image that the lens forms of a room, without noise: rays met with planes, blurred, averaged over each pixel.
+
+Optics blur before pixels sample: means over pixels that are blurred afterwards are aliased, and sides along the
+axes of the image up to 0.05 px off, by their phase.
+"""
+
+import math
 
 import cv2
 import numpy as np
@@ -6,8 +12,11 @@ import numpy as np
 from rigs.lens import Lens
 from rigs.room import Plate, Room, WALL
 
-#: Rays to the side of a pixel. Two are enough, as edges are as wide as a texel, and texels as rays are apart.
-_PER_SIDE = 2
+#: Rays to the side of a pixel: edges are as wide as a texel, and texels nearly as rays are apart. Sides along the axes
+#: of the image are 0.005 px off (rms); with two 0.010, and with four 0.003 in twice the time.
+_PER_SIDE = 3
+#: Farther away the blur has a hundredth of a percent of its middle [standard deviations].
+_REACH = 4.0
 #: Pairs of texels to the side of a cell: at least, at most.
 _PAIRS = (1, 64)
 #: Coordinate of rays that never meet a plane [m].
@@ -19,10 +28,12 @@ _HORIZON = 1e-4
 
 
 class Renderer:
-    """The view of a room through a lens."""
+    """The view of a room through a lens whose optics blur by a Gaussian of ``spread`` [px], before the pixels' area."""
 
-    def __init__(self, lens: Lens, room: Room) -> None:
-        self._lens, self._room = lens, room
+    def __init__(self, lens: Lens, room: Room, spread: float = 0.0) -> None:
+        self._lens, self._room, self._spread = lens, room, spread
+        # Pixels around those that see a plate directly.
+        self._margin = 1 + math.ceil(_REACH * spread)
         self._fine = lens.rays(lens.pixels(_PER_SIDE)).astype(np.float32)
         self._rays = lens.rays(lens.pixels()).astype(np.float32)
         # What a column of pixels has in x, and a row in y.
@@ -40,7 +51,8 @@ class Renderer:
 
     def _wall(self, T_camera_wall: np.ndarray) -> np.ndarray:
         places = _places(self._rays, T_camera_wall, self._room.wall_side, WALL)
-        return cv2.remap(self._room.wall, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        wall = cv2.remap(self._room.wall, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return _blurred(wall, self._spread)
 
     def _paint(self, image: np.ndarray, T_camera_plate: np.ndarray, plate: Plate) -> None:
         edge = 1.0 + 2.0 * plate.margin / len(plate.cells)
@@ -53,6 +65,7 @@ class Renderer:
         texture = plate.texture(2 * int(np.clip(np.round(cell_px * _PER_SIDE / 2.0), *_PAIRS)))
         places = _places(rays, T_camera_plate, edge * plate.size, len(texture))
         fine = cv2.remap(texture, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        fine = _blurred(fine, _PER_SIDE * self._spread)
         size = columns.stop - columns.start, rows.stop - rows.start
         kelvin, covered = cv2.split(cv2.resize(fine, size, interpolation=cv2.INTER_AREA))
         image[rows, columns] = image[rows, columns] * (1.0 - covered) + kelvin
@@ -64,7 +77,14 @@ class Renderer:
         if corners[:, 2].min() <= 0.0:
             return slice(0, self._lens.height), slice(0, self._lens.width)
         (left, top), (right, bottom) = (f(corners[:, :2] / corners[:, 2:], axis=0) for f in (np.min, np.max))
-        return _between(*self._rows, top, bottom), _between(*self._columns, left, right)
+        return self._between(*self._rows, top, bottom), self._between(*self._columns, left, right)
+
+    def _between(self, lowest: np.ndarray, highest: np.ndarray, begin: float, end: float) -> slice:
+        """Those whose range ``lowest`` to ``highest`` reaches into ``begin`` to ``end``, and those its blur reaches."""
+        inside = np.flatnonzero((highest >= begin) & (lowest <= end))
+        if not len(inside):
+            return slice(0, 0)
+        return slice(max(int(inside[0]) - self._margin, 0), min(int(inside[-1]) + 1 + self._margin, len(lowest)))
 
 
 def _places(rays: np.ndarray, T_camera_plane: np.ndarray, side: float, texels: int) -> np.ndarray:
@@ -76,12 +96,8 @@ def _places(rays: np.ndarray, T_camera_plane: np.ndarray, side: float, texels: i
     return met[..., :2] / met[..., 2:] * (_DOWN * np.float32(texels / side)) + np.float32(texels / 2.0 - 0.5)
 
 
-def _between(lowest: np.ndarray, highest: np.ndarray, begin: float, end: float) -> slice:
-    """Those whose range ``lowest`` to ``highest`` reaches into ``begin`` to ``end``, and one more on both sides."""
-    inside = np.flatnonzero((highest >= begin) & (lowest <= end))
-    if not len(inside):
-        return slice(0, 0)
-    return slice(max(int(inside[0]) - 1, 0), min(int(inside[-1]) + 2, len(lowest)))
+def _blurred(image: np.ndarray, spread: float) -> np.ndarray:
+    return cv2.GaussianBlur(image, (0, 0), spread, borderType=cv2.BORDER_REPLICATE) if spread > 0.0 else image
 
 
 def _finer(pixels: slice) -> slice:
