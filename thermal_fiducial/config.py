@@ -637,7 +637,7 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
         needs=('map_file',),
     )
     refinement_period: float = param(
-        2.0,
+        1.0,
         'Shortest time between two bundle adjustments; 0: none.',
         unit='s',
         minimum=0.0,
