@@ -23,7 +23,15 @@ from thermal_fiducial.config import ImuNoise, MarkerMapperConfig
 from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
-from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import (
+    apply,
+    inverse,
+    rigid_alignment,
+    so3_exp,
+    so3_log,
+    transform,
+    transform_from_quaternion,
+)
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, ImuSample
 from thermal_fiducial.files.marker_map import load_map, save_map
@@ -51,6 +59,10 @@ _LOST_PX = 2.0
 _KEPT = (Path(__file__).with_name('carpet_maps'), Path(tempfile.gettempdir()) / 'thermal_fiducial_carpet_maps')
 #: One frame in so many estimates lens and board: 50 of them.
 _OF_LENS = 16
+#: The same of the carpets: 200 of each flight.
+_OF_CARPET_LENS = 3
+#: What the lens as given may displace the carpet's corners by, at the most [m]: of 0.02 to 0.1 the same lens is found.
+_BENT_BY_LENS = 0.02
 
 
 def folder(name) -> Path:
@@ -101,20 +113,53 @@ def board_reference(camera) -> tuple[np.ndarray, np.ndarray]:
     """
     # Of its frames only the corners are needed, not the poses of each marker, which take longer than all the rest.
     flight, frames = april_board(camera, seconds=0.0), dict(_corners(folder('april_board') / f'{camera}.csv', _BOARD_S))
-    place = {key: 4 * index + np.arange(4) for index, key in enumerate(sorted(flight.marker_map.markers))}
-    known = [flight.marker_map.markers[key] for key in place]
-    squares = corners_in_map(np.stack([m.T_map_marker for m in known]), np.array([m.size for m in known]))
-    seen = [np.concatenate([place[int(key)] for key in ids]) for ids, _ in frames.values()]
-    views = self_calibration.Views(seen, [corners.reshape(-1, 2) for _, corners in frames.values()])
-    published = self_calibration.Lens(flight.camera.K, flight.camera.D)
-    some = self_calibration.Views(views.points[::_OF_LENS], views.pixels[::_OF_LENS])
-    lens, board = self_calibration.calibrate(some, published, squares.reshape(-1, 3))
+    _, _, T_map_camera = _by_own_lens(list(frames.values()), flight.marker_map, flight.camera, _OF_LENS)
     stamps = np.array(list(frames)) + round(1e9 * flight.time_offset)
-    T_map_camera = self_calibration.camera_poses(views, lens, board)
     inside = (stamps >= flight.reference_ns[0]) & (stamps <= flight.reference_ns[-1])
     mounted = inverse(flight.truth(stamps[inside])) @ T_map_camera[inside]
     R_body_camera = Rotation.from_matrix(mounted[:, :3, :3]).mean().as_matrix()
     return stamps, T_map_camera @ inverse(transform(R_body_camera, mounted[:, :3, 3].mean(axis=0)))
+
+
+def _by_own_lens(frames, marker_map, camera, every, **priors):
+    """Lens and points (P, 3) of a map, by ID, from ``every`` so many frames of its corners, and all camera poses.
+
+    Parameters
+    ----------
+    frames : IDs (N,) and corners (N, 4, 2) [px] of each; all markers are in the map
+    """
+    place = {key: 4 * index + np.arange(4) for index, key in enumerate(sorted(marker_map.markers))}
+    known = [marker_map.markers[key] for key in place]
+    squares = corners_in_map(np.stack([m.T_map_marker for m in known]), np.array([m.size for m in known]))
+    seen = [np.concatenate([place[int(key)] for key in ids]) for ids, _ in frames]
+    views = self_calibration.Views(seen, [corners.reshape(-1, 2) for _, corners in frames])
+    some = self_calibration.Views(views.points[::every], views.pixels[::every])
+    given = self_calibration.Lens(camera.K, camera.D)
+    lens, points = self_calibration.calibrate(some, given, squares.reshape(-1, 3), **priors)
+    T_map_camera = self_calibration.camera_poses(views, lens, points)
+    return lens, {key: points[where] for key, where in place.items()}, T_map_camera
+
+
+@cache
+def carpet_by_own_lens(name):
+    """What the reference of a carpet becomes with the lens estimated, which else it shares with what it judges.
+
+    Returns
+    -------
+    The lens, the carpet's corners (4, 3) [m] by ID, and the flight with this reference.
+    """
+    flight = carpet(name)
+    known = list(flight.marker_map.markers)
+    rich = {stamp: rows[np.isin(rows['id'], known)] for stamp, rows in flight.frames.items()}
+    rich = {stamp: rows for stamp, rows in rich.items() if len(rows) >= _FEWEST_MARKERS}
+    frames = [(rows['id'], corners_px(rows)) for rows in rich.values()]
+    lens, corners, T = _by_own_lens(frames, flight.marker_map, flight.camera, _OF_CARPET_LENS, board_std=_BENT_BY_LENS)
+    held = corners_in_map(np.eye(4), flight.marker_map.markers[CARPET_ORIGIN].size)
+    T_map_found = rigid_alignment(held, corners[CARPET_ORIGIN])
+    stamps = np.array(list(rich))
+    reference = _smoothed(stamps, T_map_found @ T) @ inverse(flight.T_body_camera)
+    placed = {key: apply(T_map_found, points) for key, points in corners.items()}
+    return lens, placed, replace(flight, reference_ns=stamps, reference=reference)
 
 
 @cache

@@ -40,16 +40,19 @@ class Lens:
         return Lens(K, self.D + step[4:])
 
 
-def calibrate(views, lens, board):
-    """The lens and the board's points (P, 3) that fit best, from those that are given, near to the truth."""
+def calibrate(views, lens, board, board_std=_BOARD_STD):
+    """The lens and the board's points (P, 3) that fit best, from those that are given, near to the truth.
+
+    The points are where they are given to ``board_std`` [m].
+    """
     poses = [_pose(board[seen], pixels, lens) for seen, pixels in zip(views.points, views.pixels, strict=True)]
     start = board
     for _ in range(_STEPS):
         size = _LENS + board.size
         information, right, frames = np.zeros((size, size)), np.zeros(size), []
         # A prior for the mean place, size and direction is one for each point; it decides nothing else.
-        information[range(_LENS, size), range(_LENS, size)] = (_CORNER_STD / _BOARD_STD) ** 2
-        right[_LENS:] = (_CORNER_STD / _BOARD_STD) ** 2 * (start - board).ravel()
+        information[range(_LENS, size), range(_LENS, size)] = (_CORNER_STD / board_std) ** 2
+        right[_LENS:] = (_CORNER_STD / board_std) ** 2 * (start - board).ravel()
         for seen, pixels, pose in zip(views.points, views.pixels, poses, strict=True):
             r, by_pose, by_shared, places = _linearised(seen, pixels, pose, lens, board)
             H = np.linalg.inv(by_pose.T @ by_pose)
