@@ -49,9 +49,7 @@ def weigh(
         if hypothesis.in_doubt and (shown := _shown(hypothesis, innovation)) <= config.gate:
             return hypothesis.staying_in_doubt(after, shown), accepted
         return hypothesis.accepting(after), accepted
-    # It has not moved into the map of the markers that it refuses.
-    noise = replace(adapted_noise(innovation), of_map=estimate.pose_noise.of_map)
-    refusing = hypothesis.refusing(replace(estimate, pose_noise=noise), innovation.value)
+    refusing = hypothesis.refusing(replace(estimate, pose_noise=adapted_noise(innovation)), innovation.value)
     why = f'after {coasted:.0f} s without one' if stale else f'{math.sqrt(nis):.1f} sigma'
     return refusing, PoseUpdate(stamp_ns, False, f'refused: {why}', nis)
 

@@ -164,15 +164,19 @@ def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
         now = state.derivative(innovation.motion.imu)
         state = state.moved((before - now) * error[TIME_OFFSET])
         covariance = _in_clock_of_imu(config, covariance, now, innovation)
-    noise = replace(adapted_noise(innovation), last=innovation.pose.after(prior.pose_noise.last, state.T_map_body))
+    last = innovation.pose.after(prior.pose_noise.last, state.T_map_body)
+    noise = replace(adapted_noise(innovation), last=last, of_map=prior.pose_noise.of_map)
     by_rotation = innovation.H @ innovation.of_extrinsics[:, :3]
     mount = prior.mount.after(by_rotation, innovation.S_exact, innovation.value)
     return replace(prior, state=state, covariance=covariance, pose_noise=noise, mount=mount)
 
 
 def adapted_noise(innovation: Innovation) -> PoseNoise:
-    """The noise of poses adapted to the innovation of an accepted or refused one: otherwise it would stay refused."""
-    return innovation.prior.pose_noise.adapted(innovation.units, innovation.value, innovation.S_exact)
+    """The noise of poses adapted to the innovation of an accepted or refused one: otherwise it would stay refused.
+
+    In the map of the estimate before: only an accepted pose moves it into that of its markers.
+    """
+    return innovation.estimate.pose_noise.adapted(innovation.units, innovation.value, innovation.S_exact)
 
 
 def with_unknown_clock(config: PoseEkfConfig, covariance: FloatArray) -> FloatArray:
