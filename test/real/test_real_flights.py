@@ -9,7 +9,8 @@ from support import real_flights
 from support.corner_runs import fly, rms
 
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
-from thermal_fiducial.core.geometry.se3 import apply, rigid_alignment, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.report.metrics import rigid_residuals
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('real_data')]
 
@@ -142,7 +143,7 @@ def apart_mm(corners, others):
     """Rms distance of the centres of common markers [mm], moved as one."""
     common = sorted(corners.keys() & others.keys())
     a, b = (np.array([of[key].mean(axis=0) for key in common]) for of in (corners, others))
-    return 1e3 * rms(np.linalg.norm(apply(rigid_alignment(b, a), a) - b, axis=1))
+    return 1e3 * rms(np.linalg.norm(rigid_residuals(a, b), axis=1))
 
 
 @pytest.mark.nightly

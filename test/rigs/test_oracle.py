@@ -132,8 +132,7 @@ def without_noise(lens, **sensor):
     """A rig of 30 Hz that looks ahead through clear air."""
     rig = Rig(0)
     rig.lens, rig.T_body_camera, rig.task = lens, T_MAP_CAMERA, replace(rig.task, smoke=0.0)
-    same = {'rate': 30.0, 'lag': 0.01, 'noise': 0.0, 'pattern': np.zeros(2), 'count': 0.01, 'stuck': 0}
-    rig.sensor = replace(rig.sensor, **same, **sensor)
+    rig.sensor = replace(rig.sensor, rate=30.0, lag=0.01, noise=0.0, pattern=np.zeros(2), count=0.01, stuck=0, **sensor)
     return rig
 
 

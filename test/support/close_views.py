@@ -1,6 +1,6 @@
 """Markers so near that the image cuts them off, drawn from their geometry alone: nothing of the detector is used."""
 
-from functools import cache
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -21,6 +21,8 @@ BITS = DICTIONARY.bits
 BLUR = 0.6
 #: Optics, and the pixel's own square over which the drawing averages.
 BLUR_WITH_PIXEL = float(np.hypot(BLUR, np.sqrt(1 / 12)))
+#: Rows that are drawn at a time.
+STRIP = 32
 
 
 def pose(size_px, u, v, tilt, size=0.3):
@@ -29,13 +31,9 @@ def pose(size_px, u, v, tilt, size=0.3):
     return se3.transform(R, np.array([u, v, 1.0]) * size * 265.0 / size_px)
 
 
-#: Rows that are drawn at a time.
-STRIP = 32
-
-
-@cache
+@lru_cache(maxsize=1)
 def strips(model, samples):
-    """Rays of all samples of the camera of a model, in strips of rows: the lens is solved once."""
+    """Rays of all samples of the camera of a model, in strips of rows: solved once for all views by one lens."""
     camera = CAMERAS[model]
     u, v = ((np.arange(pixels * samples) + 0.5) / samples - 0.5 for pixels in (camera.width, camera.height))
     return [rays(camera, u, rows) for rows in np.split(v, range(STRIP * samples, len(v), STRIP * samples))]

@@ -16,7 +16,7 @@ from support.scenes import motion_prior
 from support.wrong_lenses import bent_corridor
 from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, retract
+from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, transform
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
@@ -73,7 +73,7 @@ def _jitter(marker_map: MarkerMap, frames: dict[int, Any], flight: Any) -> float
         if pose is None or len(rows) < 2:
             continue
         known = [marker_map.markers[int(key)] for key in rows['id']]
-        squares = corners_in_map(np.stack([m.T_map_marker for m in known]), np.array([m.size for m in known]))
+        squares = real_flights.corners_of(known)
         solution = solve_camera_pose(
             corners_px(rows), corner_covariances(rows), squares, flight.camera, pose.T_map_camera, compete=False
         )

@@ -130,7 +130,7 @@ def _by_own_lens(frames, marker_map, camera, every, **priors):
     """
     place = {key: 4 * index + np.arange(4) for index, key in enumerate(sorted(marker_map.markers))}
     known = [marker_map.markers[key] for key in place]
-    squares = corners_in_map(np.stack([m.T_map_marker for m in known]), np.array([m.size for m in known]))
+    squares = corners_of(known)
     seen = [np.concatenate([place[int(key)] for key in ids]) for ids, _ in frames]
     views = self_calibration.Views(seen, [corners.reshape(-1, 2) for _, corners in frames])
     some = self_calibration.Views(views.points[::every], views.pixels[::every])
@@ -242,6 +242,11 @@ def map_error_mm(marker_map, other) -> float:
     return 1e3 * float(np.sqrt(np.mean(np.sum((scale * turned - b) ** 2, axis=1))))
 
 
+def corners_of(markers):
+    """Corners (N, 4, 3) [m] of markers of a map."""
+    return corners_in_map(np.stack([m.T_map_marker for m in markers]), np.array([m.size for m in markers]))
+
+
 def _camera_poses(frames, lens, marker_map):
     """Stamps (N,) and T_map_camera (N, 4, 4) by least squares over the corners of each frame."""
     stamps, poses = [], []
@@ -250,7 +255,7 @@ def _camera_poses(frames, lens, marker_map):
         if not len(rows):
             continue
         known = [marker_map.markers[int(key)] for key in rows['id']]
-        squares = corners_in_map(np.stack([m.T_map_marker for m in known]), np.array([m.size for m in known]))
+        squares = corners_of(known)
         solve = partial(solve_camera_pose, corners_px(rows), corner_covariances(rows), squares, lens)
         solution = solve(poses[-1], compete=False) if poses else solve()
         solution = solution if solution.rms_px < _LOST_PX else solve()
