@@ -35,16 +35,16 @@ def pytest_collection_finish():
     gc.set_threshold(10_000, 10, 10)
 
 
-#: Where ``make coverage`` traces the core: its own tests run 97 % of it, and those of other layers hardly more.
+#: Where ``make coverage`` traces the core: its own tests run 98 % of it, and those of other layers hardly more.
 _TRACED = [Path(__file__).parent / folder for folder in ('unit/core', 'property')]
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item):
-    """Trace only the tests of the core, as tracing doubles the time of all Python."""
+    """Trace only what runs more of the core, as tracing doubles the time of all Python."""
     plugin = item.config.pluginmanager.get_plugin('_cov')
     control = getattr(plugin, 'cov_controller', None)
-    if control is None or _is_of_the_core(item):
+    if control is None or _runs_more_of_the_core(item):
         return (yield)
     control.pause()
     try:
@@ -53,8 +53,11 @@ def pytest_runtest_protocol(item):
         control.resume()
 
 
-def _is_of_the_core(item):
-    return any(item.path.is_relative_to(folder) for folder in _TRACED)
+def _runs_more_of_the_core(item):
+    """Whether it is a test of the core, not one of many flights, and with its first parameters: others run the same."""
+    of_the_core = any(item.path.is_relative_to(folder) for folder in _TRACED)
+    first = not hasattr(item, 'callspec') or not any(item.callspec.indices.values())
+    return of_the_core and first and item.get_closest_marker('slow') is None
 
 
 @pytest.fixture(scope='session')

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from support import flights
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
@@ -30,6 +31,7 @@ class Interrupted(flights.Motion):
         return first * rate if order == 1 else super()._sum(table, own, 2) * rate**2 + first * change
 
 
+@pytest.mark.slow
 def test_a_clock_that_drifts_while_nothing_shows_it_is_allowed_for():
     """Seventy seconds of hover, in which the offset moves by 3.5 ms."""
     drawn = flights.Motion.random(np.random.default_rng(101), speed=1.5, turn=0.75)

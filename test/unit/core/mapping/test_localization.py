@@ -151,6 +151,7 @@ def test_odometry_counts_by_what_it_is_worth():
     assert claim_between(1.0) > 0.3
 
 
+@pytest.mark.slow
 def test_many_frames_do_not_confirm_an_error_of_the_odometry():
     """A marker from the front: a turn about either side of the line of sight looks alike, and hardly shows at all."""
     nees = []

@@ -16,6 +16,7 @@ def check(seeds, frames):
     assert 0.3 < of_poses < 1.7
 
 
+@pytest.mark.slow
 def test_a_corridor_claims_how_much_the_lens_bends_it():
     check(3, 400)
 
@@ -25,6 +26,7 @@ def test_corridors_claim_how_much_their_lenses_bend_them():
     check(8, 600)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('seeds', 'frames', 'largest'), [(2, 400, 1.4), pytest.param(8, 600, 2.5, marks=pytest.mark.nightly)]
 )
