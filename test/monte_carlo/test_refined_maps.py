@@ -72,7 +72,9 @@ def nees(seed, is_fixed):
     return np.mean([d @ np.linalg.solve(built.map.markers[key].covariance, d) / 6.0 for key, d in errors.items()])
 
 
-@pytest.mark.parametrize('is_fixed', [True, False], ids=['one fixed', 'none fixed'])
+@pytest.mark.parametrize(
+    'is_fixed', [pytest.param(True, id='one fixed', marks=pytest.mark.nightly), pytest.param(False, id='none fixed')]
+)
 @pytest.mark.parametrize('rooms', [3, pytest.param(12, marks=pytest.mark.nightly)])
 def test_maps_written_by_hand_and_refined_claim_their_errors(rooms, is_fixed):
     found = np.mean([nees(seed, is_fixed) for seed in range(rooms)])

@@ -284,7 +284,7 @@ def test_a_map_that_is_not_the_one_in_view_is_named():
         calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, IMU)
 
 
-@pytest.mark.parametrize('readout', [0.0, READOUT])
+@pytest.mark.parametrize('readout', [pytest.param(0.0, marks=pytest.mark.nightly), READOUT])
 def test_readout_time_and_extrinsics_within_their_errors(readout):
     frames, camera, imu = rolling_recording(SCENARIO, 15.0, 1, readout, sigma_px=0.1)
     result = calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, IMU)

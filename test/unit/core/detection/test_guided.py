@@ -110,7 +110,7 @@ def test_wrong_prediction_leaves_the_blind_search_to_find_all():
     assert rows['id'].tolist() == sorted(frame.corners_px)
 
 
-@pytest.mark.parametrize('rate', [8.6, 30.0, 60.0])
+@pytest.mark.parametrize('rate', [8.6, 30.0, pytest.param(60.0, marks=pytest.mark.nightly)])
 def test_a_marker_that_is_not_mapped_is_found_as_soon_at_any_frame_rate(rate):
     """It comes into view while the mapped ones are where odometry has them: within the period and a frame more."""
     (frame,) = frames(8.0, 1)

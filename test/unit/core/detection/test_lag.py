@@ -192,7 +192,7 @@ def test_lag_of_a_marker_that_grows_is_removed_though_its_centre_stays():
         assert np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)) < 0.06
 
 
-@pytest.mark.parametrize('lag_blur', [(10.0, 0.0), (-8.0, 5.0)])
+@pytest.mark.parametrize('lag_blur', [pytest.param((10.0, 0.0), marks=pytest.mark.nightly), (-8.0, 5.0)])
 def test_corners_are_right_where_motion_blur_is_longer_than_cells(lag_blur):
     """A marker with cells of 5 px, which lag displaces by 10 px in the mean."""
     decoder, image, corners = lagging(5, lag_blur)
@@ -207,7 +207,9 @@ def test_corners_are_right_where_motion_blur_is_longer_than_cells(lag_blur):
 
 
 @pytest.mark.parametrize(('bent', 'allowed'), [(0.5, 0.02), (1.0, 0.01), (2.0, 0.04)])
-@pytest.mark.parametrize(('cell', 'lag_blur'), [(7, (1.7, 0.0)), (12, (-2.5, 2.0))])
+@pytest.mark.parametrize(
+    ('cell', 'lag_blur'), [(7, (1.7, 0.0)), pytest.param(12, (-2.5, 2.0), marks=pytest.mark.nightly)]
+)
 def test_a_marker_in_motion_shows_the_gray_scale_of_a_display(cell, lag_blur, bent, allowed):
     """Bolometers lag, and then their counts are bent."""
     decoder, image, corners = lagging(cell, lag_blur, beyond=1.0)

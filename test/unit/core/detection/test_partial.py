@@ -89,7 +89,7 @@ def turning(view, rate):
     return image, T, Twist(np.concatenate([np.zeros(3), turn]), 1e-9 * np.eye(6))
 
 
-@pytest.mark.parametrize('rate', [0.2, 0.5, 1.0])
+@pytest.mark.parametrize('rate', [*(pytest.param(rate, marks=pytest.mark.nightly) for rate in (0.2, 0.5)), 1.0])
 @pytest.mark.parametrize('view', ['side', 'small'])
 def test_what_lags_behind_in_a_turn_displaces_no_corner(view, rate):
     """By 1 to 5 px; edges with a tail that are fitted as if blur were symmetric seem a fifth of that ahead."""

@@ -129,7 +129,7 @@ def test_small_markers_in_counts_have_their_size_in_and_out_of_focus(side, tilt_
     assert 0.3 < np.concatenate(squares).mean() < 1.6
 
 
-@pytest.mark.parametrize('cells', [3, 5, 6])
+@pytest.mark.parametrize('cells', [pytest.param(3, marks=pytest.mark.nightly), 5, 6])
 def test_other_squares_are_no_markers(cells):
     """Random bits in a black border, of as many cells as no marker of this dictionary has: 480 squares."""
     dictionary, found = load_dictionary('DICT_4X4_50'), []

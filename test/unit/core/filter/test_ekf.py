@@ -85,7 +85,7 @@ def in_order(short_flight):
     return after(short_flight, 0.0, **KNOWN_CLOCK)
 
 
-@pytest.mark.parametrize('delay', [0.05, 0.4, 'random'])
+@pytest.mark.parametrize('delay', [pytest.param(0.05, marks=pytest.mark.nightly), 0.4, 'random'])
 def test_late_and_out_of_order_poses_equal_in_order_processing(short_flight, in_order, delay):
     flight, late = short_flight, after(short_flight, delay, **KNOWN_CLOCK)
     late_now, now = late.estimate, in_order.estimate
