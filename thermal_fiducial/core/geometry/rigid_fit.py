@@ -129,27 +129,37 @@ def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = 
     ``points`` are (B or 1, K, 3) [m] in their bodies. Of a whitened error d, the cost is d^2 up to ``inlier`` and
     ``inlier^2 (1 + 2 log(d / inlier))`` beyond.
     """
+    residual, J, seen = linearised(T, points, images)
+    squared, J_transposed = (residual * residual).sum(axis=(-1, -2)), J.swapaxes(-1, -2)
+    if inlier < np.inf:
+        squared, weights = robust(squared, inlier**2)
+        J_transposed = J_transposed * np.repeat(weights, 2, axis=-1)[:, None]
+    gradient = (J_transposed @ residual.reshape(*J.shape[:2], 1))[..., 0]
+    return np.where(seen, squared.sum(axis=-1), np.inf), gradient, J_transposed @ J
+
+
+def linearised(T: FloatArray, points: FloatArray, images: Images) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Whitened images of ``points`` (B or 1, K, 3) [m] of bodies at poses (B, 4, 4) in the camera.
+
+    Returns
+    -------
+    predicted minus measured (B, K, 2, 1), its derivative (B, 2 K, 6) for steps of the bodies' origins and rotations
+    about these, both in the axes of the camera, and which (B,) bodies are before it
+    """
     rotated = points @ T[:, :3, :3].swapaxes(-1, -2)
     p = rotated + T[:, None, :3, 3]
     z = p[..., 2:]
-    seen = (z > TINY).all(axis=(1, 2))
+    seen: BoolArray = np.asarray((z > TINY).all(axis=(1, 2)))
     z = np.maximum(z, TINY)
     W = images.whitening
     seen_at = W @ (p[..., :2] / z)[..., None]
-    residual = seen_at - images.target[..., None]
     d_p = np.empty((*p.shape[:2], 2, 3))
     d_p[..., :2], d_p[..., 2:] = W, -seen_at
     d_p /= z[..., None]
     J = np.empty((*p.shape[:2], 2, 6))
     J[..., :3] = d_p
     np.matmul(d_p, (rotated @ _MINUS_SKEW).reshape(*p.shape, 3), out=J[..., 3:])
-    J = J.reshape(len(T), 2 * p.shape[1], 6)
-    squared, J_transposed = (residual * residual).sum(axis=(-1, -2)), J.swapaxes(-1, -2)
-    if inlier < np.inf:
-        squared, weights = robust(squared, inlier**2)
-        J_transposed = J_transposed * np.repeat(weights, 2, axis=-1)[:, None]
-    gradient = (J_transposed @ residual.reshape(len(T), 2 * p.shape[1], 1))[..., 0]
-    return np.where(seen, squared.sum(axis=-1), np.inf), gradient, J_transposed @ J
+    return seen_at - images.target[..., None], J.reshape(len(T), 2 * p.shape[1], 6), seen
 
 
 def robust(squared: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:

@@ -8,9 +8,10 @@ import numpy as np
 
 from thermal_fiducial.config import CHI2_OF_POSE
 from thermal_fiducial.core.error_model import CHI2_OF_VIEW, SystematicErrors
-from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, linearise, retract, whitening
-from thermal_fiducial.core.geometry.rigid_fit import BEHIND_CHI2, robust
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, marker_corners, retract, whitening
+from thermal_fiducial.core.geometry.rigid_fit import BEHIND_CHI2, Images, linearised, robust
+from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.lens_errors import of_aspect
 from thermal_fiducial.core.mapping.map_data import exact, gauge, MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations, Vectors
@@ -130,15 +131,14 @@ class Poses:
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals (n, 8) and Jacobians (n, 8, 6) of the n views at a state, whitened but not weighted.
-
-    And how the keyframes' poses by odometry follow the pose of its frame, (F, 6, 6).
-    """
+    """Residuals (n, 8) and Jacobians (n, 8, 6) by the markers of the n views at a state, whitened but not weighted."""
 
     state: Poses
     r: FloatArray
-    J_camera: FloatArray
-    J_marker: FloatArray
+    J: FloatArray
+    #: (n, 6, 6) transposed: displacement of the marker of a view that looks like one of its camera
+    to_camera: FloatArray
+    #: (F, 6, 6) how the keyframes' poses by odometry follow the pose of its frame
     J_odometry: FloatArray
     chi2: FloatArray
     #: differences (F, 6) and (M, 6) from the state to the priors, and their chi squares (F,), (M,)
@@ -180,6 +180,7 @@ class MapProblem:
     camera: IntArray
     corners: FloatArray
     W: FloatArray
+    images: Images
     #: the calibration with the most views, whose aspect ratio is estimated: (n, 8, 1) whitened corners by one standard
     #: deviation of it
     lens: int
@@ -216,6 +217,7 @@ class MapProblem:
             camera=camera,
             corners=snapshot.corners[views],
             W=W,
+            images=_images(snapshot, camera, W, snapshot.corners[views]),
             lens=lens,
             J_lens=J_lens,
             odometry=Priors(snapshot.odometry.T[frames], snapshot.odometry.information[frames]),
@@ -226,24 +228,22 @@ class MapProblem:
         """Whitened residuals and derivatives."""
         n = len(self.frame)
         T_map_camera, T_map_marker = state.T_map_camera[self.frame], state.T_map_marker[self.marker]
-        uv, J_camera, J_marker = np.empty((n, 4, 2)), np.empty((n, 8, 6)), np.empty((n, 8, 6))
-        for index, camera in enumerate(self.cameras):
-            own = self.camera == index
-            uv[own], J_camera[own], J_marker[own] = linearise(
-                camera, T_map_camera[own], T_map_marker[own], self.sizes[self.marker[own]]
-            )
+        corners = marker_corners(self.sizes)[self.marker]
+        off, J, seen = linearised(inverse(T_map_camera) @ T_map_marker, corners, self.images)
+        # From the axes of the camera to those of the map.
+        R_camera_map = np.ascontiguousarray(T_map_camera[:, :3, :3].swapaxes(-1, -2))
+        J = (J.reshape(n, 16, 3) @ R_camera_map).reshape(n, 8, 6)
+        r = -off.reshape(n, 8) - self.J_lens @ state.lens
         # Markers behind the camera have no gradient, and the cost of an outlier.
-        behind = ~np.all(np.isfinite(uv), axis=(1, 2))
-        J_camera[behind], J_marker[behind] = 0.0, 0.0
-        r = (self.W @ (self.corners - uv)[..., None]).reshape(n, 8) - self.J_lens @ state.lens
-        r[behind] = 0.0
-        chi2 = np.where(behind, BEHIND_CHI2, np.sum(r * r, axis=-1))
-        J_camera, J_marker = ((self.W @ J.reshape(n, 4, 2, 6)).reshape(n, 8, 6) for J in (J_camera, J_marker))
+        r[~seen], J[~seen] = 0.0, 0.0
+        chi2 = np.where(seen, np.sum(r * r, axis=-1), BEHIND_CHI2)
+        # Moved like the camera, but the other way round.
+        to_camera = -lever_arm(T_map_marker[:, :3, 3] - T_map_camera[:, :3, 3]).swapaxes(-1, -2)
         J_odometry = lever_arm(self.odometry.T[:, :3, 3] @ state.T_map_odometry[:3, :3].T)
         of_cameras = self.odometry.moved(state.T_map_odometry).apart(state.T_map_camera)
         of_markers = self.known.apart(state.T_map_marker)
         of_lens = float(self.lens_information * state.lens @ state.lens)
-        return Linearised(state, r, J_camera, J_marker, J_odometry, chi2, *of_cameras, *of_markers, of_lens)
+        return Linearised(state, r, J, to_camera, J_odometry, chi2, *of_cameras, *of_markers, of_lens)
 
     def rms_px(self, now: Linearised) -> float:
         """Rms re-projection error of all corners [px]."""
@@ -291,19 +291,21 @@ class MapProblem:
     def normal(self, now: Linearised, scale: float) -> tuple[Blocks, Vectors]:
         """Normal equations, and their right sides."""
         weights = now.weights(scale)[:, None, None]
-        of_camera, of_marker = (weights * np.swapaxes(J, -1, -2) for J in (now.J_camera, now.J_marker))
+        of_marker = weights * np.swapaxes(now.J, -1, -2)
+        node, by_lens = of_marker @ now.J, of_marker @ self.J_lens
+        cross = now.to_camera @ node
         odometry, known = self.odometry.weighted(now.camera_chi2), self.known.weighted(now.marker_chi2)
         of_camera_by_odometry = odometry @ now.J_odometry
         of_odometry = np.swapaxes(now.J_odometry, -1, -2) @ of_camera_by_odometry
         count = self.J_lens.shape[-1]
         lens = (np.sqrt(weights) * self.J_lens).reshape(-1, count)
         blocks = Blocks(
-            frame=self.over_frames(of_camera @ now.J_camera) + odometry,
-            node=_with_odometry(self.over_markers(of_marker @ now.J_marker) + known, of_odometry),
-            cross=np.concatenate([of_camera @ now.J_marker, -of_camera_by_odometry]),
+            frame=self.over_frames(cross @ np.swapaxes(now.to_camera, -1, -2)) + odometry,
+            node=_with_odometry(self.over_markers(node) + known, of_odometry),
+            cross=np.concatenate([cross, -of_camera_by_odometry]),
             common=Vectors(
-                self.over_frames(of_camera @ self.J_lens),
-                _with_odometry(self.over_markers(of_marker @ self.J_lens), np.zeros((1, 6, count))),
+                self.over_frames(now.to_camera @ by_lens),
+                _with_odometry(self.over_markers(by_lens), np.zeros((1, 6, count))),
                 lens.T @ lens + self.lens_information * np.eye(count),
             ),
         )
@@ -319,10 +321,10 @@ class MapProblem:
         of_views : (n, 8, k) weighted residuals
         of_odometry, of_known : (F, 6, k), (M, 6, k) information times differences from the priors
         """
-        of_frames, of_markers = (np.swapaxes(J, -1, -2) @ of_views for J in (now.J_camera, now.J_marker))
+        of_markers = np.swapaxes(now.J, -1, -2) @ of_views
         back = -np.swapaxes(now.J_odometry, -1, -2) @ of_odometry
         return Vectors(
-            self.over_frames(of_frames) + of_odometry,
+            self.over_frames(now.to_camera @ of_markers) + of_odometry,
             _with_odometry(self.over_markers(of_markers) + of_known, back),
             np.tensordot(self.J_lens, of_views, axes=([0, 1], [0, 1])),
         )
@@ -341,6 +343,16 @@ class MapProblem:
 def _with_odometry(of_markers: FloatArray, of_frames: FloatArray) -> FloatArray:
     """Those of M markers (M, ...), and last the sum over the keyframes (F, ...): (M + 1, ...)."""
     return np.concatenate([of_markers, np.sum(of_frames, axis=0, keepdims=True)])
+
+
+def _images(snapshot: Snapshot, camera: IntArray, W: FloatArray, corners: FloatArray) -> Images:
+    """Whitened images of n views by their cameras (n,), without the distortion of the lenses."""
+    whitened = Images(np.empty_like(W), np.empty_like(corners))
+    for index, lens in enumerate(snapshot.cameras):
+        own = camera == index
+        images = Images.of(ImagePoints.at(corners[own], lens), W[own])
+        whitened.whitening[own], whitened.target[own] = images.whitening, images.target
+    return whitened
 
 
 def _lens(snapshot: Snapshot, lens: int, camera: IntArray, corners: FloatArray, W: FloatArray) -> FloatArray:

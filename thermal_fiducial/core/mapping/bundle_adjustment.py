@@ -171,7 +171,7 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
             draws=draws[i],
             surveyed=False,
         )
-        if two_places(now.r[own], now.J_marker[own], ~full[own]):
+        if two_places(now.r[own], now.J[own], ~full[own]):
             inconsistent[key] = float(np.mean(~full[own]))
     return AdjustedMap(
         markers,

@@ -9,7 +9,7 @@ from support.walls import CAMERA, flight, mirrored, NO_SYSTEMATIC_ERRORS, see, S
 from support.wrong_lenses import drawn_lens
 
 from thermal_fiducial.core.error_model import covariance_by_draws, draws_of, SystematicErrors
-from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
 from thermal_fiducial.core.mapping.adjustment_problem import MapProblem
@@ -113,10 +113,12 @@ def test_the_schur_complement_answers_like_the_whole_system(fixed):
             for j, J_j in terms:
                 H[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] += J_i.T @ J_j
 
-    for v in range(len(problem.frame)):
+    T_map_camera, T_map_marker = problem.start.T_map_camera[problem.frame], problem.start.T_map_marker[problem.marker]
+    _, *J_px = linearise(problem.cameras[0], T_map_camera, T_map_marker, problem.sizes[problem.marker])
+    whitened = [(problem.W @ J.reshape(-1, 4, 2, 6)).reshape(-1, 8, 6) for J in J_px]
+    for v, (J_camera, J_marker) in enumerate(zip(*whitened, strict=True)):
         w = np.sqrt(e.weights(1.0)[v])
-        terms = [(problem.frame[v], w * e.J_camera[v]), (F + problem.marker[v], w * e.J_marker[v])]
-        add(terms, w * e.r[v])
+        add([(problem.frame[v], w * J_camera), (F + problem.marker[v], w * J_marker)], w * e.r[v])
     prior, covariance = s.known[1]
     # No place is known better than to 0.1 mm and mrad.
     root = np.linalg.cholesky(np.linalg.inv(covariance + 1e-8 * np.eye(6))).T
