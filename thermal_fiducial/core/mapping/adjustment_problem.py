@@ -271,10 +271,35 @@ class MapProblem:
 
     def markers_stepped(self, now: Linearised, scale: float) -> Poses:
         """After one Gauss-Newton step of each marker alone."""
-        blocks, sides = self.normal(now, scale)
-        largest = np.max(blocks.node, axis=(1, 2), keepdims=True)
-        steps = np.linalg.solve(blocks.node + (TINY * largest + TINY) * np.eye(6), sides.nodes)
-        return replace(now.state, T_map_marker=retract(now.state.T_map_marker, steps[:-1, :, 0]))
+        J_transposed = now.weights(scale)[:, None, None] * np.swapaxes(now.J, -1, -2)
+        known = self.known.weighted(now.marker_chi2)
+        information = self.over_markers(J_transposed @ now.J) + known
+        sides = self.over_markers(J_transposed @ now.r[..., None]) + known @ now.marker_apart[..., None]
+        largest = np.max(information, axis=(1, 2), keepdims=True)
+        steps = np.linalg.solve(information + (TINY * largest + TINY) * np.eye(6), sides)
+        return replace(now.state, T_map_marker=retract(now.state.T_map_marker, steps[..., 0]))
+
+    def only(self, views: BoolArray) -> 'MapProblem':
+        """The same unknowns with some of the ``views`` (n,); for steps of markers alone."""
+        return replace(
+            self,
+            frame=self.frame[views],
+            marker=self.marker[views],
+            camera=self.camera[views],
+            corners=self.corners[views],
+            W=self.W[views],
+            images=Images(self.images.whitening[views], self.images.target[views]),
+            J_lens=self.J_lens[views],
+        )
+
+    def spread(self, most: int) -> BoolArray:
+        """Which views (n,) are of at most so many of each marker, at equal distances among all of these."""
+        counts = np.bincount(self.marker, minlength=len(self.ids))
+        place = np.empty_like(self.marker)
+        place[np.argsort(self.marker, kind='stable')] = np.arange(len(place)) - np.repeat(
+            np.cumsum(counts) - counts, counts
+        )
+        return np.asarray(place % np.ceil(counts / most).astype(int)[self.marker] == 0)
 
     @cached_property
     def equations(self) -> NormalEquations:
@@ -337,7 +362,9 @@ class MapProblem:
         """Sums (M, ...) over the views of each marker."""
         order = np.argsort(self.marker, kind='stable')
         starts = np.flatnonzero(np.diff(self.marker[order], prepend=-1))
-        return np.asarray(np.add.reduceat(values[order], starts, axis=0))
+        sums = np.zeros((len(self.ids), *values.shape[1:]))
+        sums[self.marker[order[starts]]] = np.add.reduceat(values[order], starts, axis=0)
+        return sums
 
 
 def _with_odometry(of_markers: FloatArray, of_frames: FloatArray) -> FloatArray:

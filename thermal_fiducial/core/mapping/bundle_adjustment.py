@@ -16,8 +16,8 @@ import numpy as np
 from thermal_fiducial.core.error_model import noise_factor
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
-from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Snapshot
-from thermal_fiducial.core.mapping.candidates import UNAMBIGUOUS
+from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Poses, Snapshot
+from thermal_fiducial.core.mapping.candidates import MAX_VIEWS, UNAMBIGUOUS
 from thermal_fiducial.core.mapping.error_sources import ErrorSources
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
@@ -131,19 +131,29 @@ def _minimise(problem: MapProblem, now: Linearised) -> Linearised:
 def _with_mirrored(problem: MapProblem, now: Linearised) -> Linearised | None:
     """The state with markers in their other pose where all their views together prefer it; None if none do.
 
-    A marker enters the map by a few views, whose errors may favour the wrong one of the planar ambiguity together.
+    A marker enters the map by a few views, whose errors may favour the wrong one of the planar ambiguity together. All
+    views are asked only of markers whose other pose is not ruled out by as many of them as place a new marker.
     """
-    scale, other = _scale(now.chi2), problem.mirrored(now.state)
-    for _ in range(_MIRRORED_STEPS):
-        other = problem.markers_stepped(problem.evaluate(other), scale)
-    mirrored = problem.evaluate(other)
-    gains = problem.over_markers(now.view_costs(scale) - mirrored.view_costs(scale))
-    better = gains > UNAMBIGUOUS * scale
-    better &= ~problem.held & ~problem.known.information.any(axis=(1, 2))
+    scale = _scale(now.chi2)
+    _, gains = _mirrored(problem.only(problem.spread(MAX_VIEWS)), now.state, scale)
+    possible = ~problem.held & ~problem.known.information.any(axis=(1, 2)) & (gains > -UNAMBIGUOUS * scale)
+    if not possible.any():
+        return None
+    T_mirrored, gains = _mirrored(problem.only(possible[problem.marker]), now.state, scale)
+    better = possible & (gains > UNAMBIGUOUS * scale)
     if not better.any():
         return None
-    T_map_marker = np.where(better[:, None, None], other.T_map_marker, now.state.T_map_marker)
+    T_map_marker = np.where(better[:, None, None], T_mirrored, now.state.T_map_marker)
     return problem.evaluate(replace(now.state, T_map_marker=T_map_marker))
+
+
+def _mirrored(problem: MapProblem, state: Poses, scale: float) -> tuple[FloatArray, FloatArray]:
+    """Poses (M, 4, 4) of all markers mirrored and fitted each alone, and what this lowers the costs (M,) by."""
+    other = problem.mirrored(state)
+    for _ in range(_MIRRORED_STEPS):
+        other = problem.markers_stepped(problem.evaluate(other), scale)
+    before, after = (problem.evaluate(poses).view_costs(scale) for poses in (state, other))
+    return other.T_map_marker, problem.over_markers(before - after)
 
 
 def _scale(chi2: FloatArray) -> float:
