@@ -8,14 +8,13 @@ arguments: only these. Recordings are taken where ``THERMAL_FIDUCIAL_DATA`` name
 from dataclasses import replace
 from functools import partial
 import sys
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from support.mapper_scenes import SCENES
 from support.taken_out import Mechanism, Study
 
-from thermal_fiducial.core.error_model import SystematicErrors
+from thermal_fiducial.core.error_model import DRAWS, SystematicErrors
 from thermal_fiducial.core.mapping.localization import locate
 
 MAPPING = 'thermal_fiducial.core.mapping'
@@ -30,6 +29,11 @@ def _ignored(*_: Any, **__: Any) -> None:
 def _independent(gains: Any, draws: Any) -> Any:
     """Draws of a pose's error by markers whose errors have nothing in common."""
     return np.sqrt(len(draws)) * np.concatenate(list(gains @ draws), axis=-1)
+
+
+def _no_lens(_: Any, gains: Any, of: Any, count: int, errors: Any) -> Any:
+    """Draws of what the lenses have no part in."""
+    return np.zeros((count, gains.shape[2], DRAWS))
 
 
 def _placed_together(stamp_ns: int, sight: Any, **given: Any) -> Any:
@@ -112,11 +116,11 @@ MECHANISMS = {
     'lens in the errors of the map': Mechanism(
         ('bent corridor', 'wall'),
         ('error_sources:LensErrors',),
-        {'error_sources:LensErrors': lambda *_: SimpleNamespace(drawn=lambda chosen: 0.0)},
+        {'error_sources:ErrorSources._by_lenses': _no_lens},
     ),
     'joint draws of the map': Mechanism(
         ('bent corridor', 'wall', 'uneven map'),
-        ('error_sources:ErrorSources._noise', 'error_sources:ErrorSources._solved'),
+        ('error_sources:ErrorSources._lasting', 'normal_equations:BorderedSystem.drawn'),
         {'joint_fit:drawn_sum': _independent},
     ),
     'priors': Mechanism(

@@ -6,13 +6,14 @@ Regression", JMLR 2005). Poses and maps from one camera have errors of the same 
 """
 
 from functools import cache, lru_cache
+from itertools import pairwise
 from zlib import crc32
 
 import numpy as np
 
 from thermal_fiducial.core.error_model import DRAWS, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, IntArray
 
 #: Nodes are at most this many lengths of the process apart: between them its variance is known to 1 %.
 _NODES_APART = 1.0
@@ -51,14 +52,40 @@ class LensErrors:
         of_lengths = np.tensordot(gains, lengths, axes=([0, 2], [1, 2]))
         return np.asarray(np.tensordot(mixed, mixed, axes=([0, 2], [0, 2])) + of_lengths @ of_lengths.T)
 
-    def drawn(self, chosen: slice = slice(None)) -> FloatArray:
-        """The errors (..., 2, k) [px] in the ``chosen`` ones of :data:`DRAWS` draws."""
-        lens, (focal_length, aspect) = self._variables
-        if self._aspect_left is not None:
-            aspect = self._aspect_left
-        smooth = np.tensordot(self.modes, self._px * lens[..., chosen], axes=1)
-        of_lengths = self.of_focal_length[..., None] * focal_length[chosen]
-        return np.asarray(smooth + of_lengths + self._of_aspect[..., None] * aspect[chosen])
+    def drawn_sums(self, gains: FloatArray, starts: IntArray) -> FloatArray:
+        """:data:`DRAWS` draws (G, m, K) of sums over groups of successive corners.
+
+        Parameters
+        ----------
+        gains : (n, m, 2) derivatives by the corners [1/px]
+        starts : (G,) first corner of each group
+        """
+        modes, by_axes = self.modes.reshape(len(gains), -1), gains.reshape(len(gains), -1)
+        bounds = pairwise([*starts.tolist(), len(gains)])
+        smooth = np.stack([modes[first:end].T @ by_axes[first:end] for first, end in bounds])
+        smooth = smooth.reshape(*smooth.shape[:2], *gains.shape[1:])
+        draws = np.tensordot(smooth, self._px * self._variables[0], axes=([1, 3], [0, 1]))
+        lengths = (self.of_focal_length, self._variables[1][0]), (self._of_aspect, self._aspects)
+        for of_length, drawn in lengths:
+            moved = np.einsum('nmu,nu->nm', gains, of_length.reshape(-1, 2))
+            draws += np.add.reduceat(moved, starts, axis=0)[..., None] * drawn
+        return np.asarray(draws)
+
+    def drawn_sum(self, gains: FloatArray) -> FloatArray:
+        """:data:`DRAWS` draws (m, K) of what has derivatives ``gains`` (n, m, 2) [1/px] by the corners."""
+        return np.asarray(self.drawn_sums(gains, np.zeros(1, dtype=np.int64))[0])
+
+    def drawn(self) -> FloatArray:
+        """The errors (..., 2, K) [px] in :data:`DRAWS` draws."""
+        lens, (focal_length, _) = self._variables
+        smooth = np.tensordot(self.modes, self._px * lens, axes=1)
+        of_lengths = self.of_focal_length[..., None] * focal_length + self._of_aspect[..., None] * self._aspects
+        return np.asarray(smooth + of_lengths)
+
+    @property
+    def _aspects(self) -> FloatArray:
+        """(K,) draws of what is not known of the aspect ratio."""
+        return self.aspect_draws if self._aspect_left is None else self._aspect_left
 
     @property
     def _variables(self) -> tuple[FloatArray, FloatArray]:

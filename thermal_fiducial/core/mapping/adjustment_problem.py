@@ -201,9 +201,12 @@ class MapProblem:
         if np.all(held):
             return None
         T_map_marker = np.stack([m.T_map_marker for m in markers])
-        camera, W = snapshot.camera[frames][frame], whitening(snapshot.covariances[views])
+        used, camera = np.unique(snapshot.camera[frames][frame], return_inverse=True)
+        cameras = tuple(snapshot.cameras[place] for place in used.tolist())
+        corners, W = snapshot.corners[views], whitening(snapshot.covariances[views])
         lens = int(np.argmax(np.bincount(camera)))
-        J_lens = _lens(snapshot, lens, camera, snapshot.corners[views], W)
+        J_lens = W @ of_aspect(corners, cameras[lens], snapshot.errors)[..., None]
+        J_lens = np.where((camera == lens)[:, None, None], J_lens.reshape(-1, 8, 1), 0.0)
         return cls(
             start=Poses(snapshot.T_map_camera[frames], T_map_marker, np.zeros(J_lens.shape[-1])),
             ids=marker_ids.tolist(),
@@ -211,13 +214,13 @@ class MapProblem:
             sizes=np.array([m.size for m in markers]),
             held=held,
             anchors=gauge(markers),
-            cameras=snapshot.cameras,
+            cameras=cameras,
             frame=frame,
             marker=marker,
             camera=camera,
-            corners=snapshot.corners[views],
+            corners=corners,
             W=W,
-            images=_images(snapshot, camera, W, snapshot.corners[views]),
+            images=_images(cameras, camera, corners, W),
             lens=lens,
             J_lens=J_lens,
             odometry=Priors(snapshot.odometry.T[frames], snapshot.odometry.information[frames]),
@@ -372,20 +375,14 @@ def _with_odometry(of_markers: FloatArray, of_frames: FloatArray) -> FloatArray:
     return np.concatenate([of_markers, np.sum(of_frames, axis=0, keepdims=True)])
 
 
-def _images(snapshot: Snapshot, camera: IntArray, W: FloatArray, corners: FloatArray) -> Images:
-    """Whitened images of n views by their cameras (n,), without the distortion of the lenses."""
+def _images(cameras: tuple[Camera, ...], camera: IntArray, corners: FloatArray, W: FloatArray) -> Images:
+    """Whitened images of n views, each by its ``camera`` (n,), without the distortion of the lenses."""
     whitened = Images(np.empty_like(W), np.empty_like(corners))
-    for index, lens in enumerate(snapshot.cameras):
+    for index, calibration in enumerate(cameras):
         own = camera == index
-        images = Images.of(ImagePoints.at(corners[own], lens), W[own])
+        images = Images.of(ImagePoints.at(corners[own], calibration), W[own])
         whitened.whitening[own], whitened.target[own] = images.whitening, images.target
     return whitened
-
-
-def _lens(snapshot: Snapshot, lens: int, camera: IntArray, corners: FloatArray, W: FloatArray) -> FloatArray:
-    """Whitened corners (n, 4, 2) of n views by one standard deviation of the aspect ratio of one lens, (n, 8, 1)."""
-    J = W @ of_aspect(corners, snapshot.cameras[lens], snapshot.errors)[..., None]
-    return np.where((camera == lens)[:, None, None], J.reshape(len(J), 8, 1), 0.0)
 
 
 def _known(snapshot: Snapshot, ids: IntArray, T_map_marker: FloatArray) -> Priors:

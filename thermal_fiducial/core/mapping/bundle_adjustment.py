@@ -70,13 +70,12 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
     problem = MapProblem.build(snapshot)
     if problem is None:
         return None
-    now = _minimise(problem, problem.evaluate(problem.start))
-    mirrored = _with_mirrored(problem, now)
-    now = now if mirrored is None else _minimise(problem, mirrored)
+    now = problem.evaluate(problem.start)
     if problem.J_lens.any():
         problem = _weighed(problem, snapshot, now)
-        # The map follows the aspect ratio linearly, by far less than a step of a minimisation: one is enough.
-        now = problem.step(problem.evaluate(now.state), _scale(now.chi2), TINY) or now
+    now = _minimise(problem, now)
+    mirrored = _with_mirrored(problem, now)
+    now = now if mirrored is None else _minimise(problem, mirrored)
     return _result(problem, snapshot, now)
 
 
@@ -104,10 +103,9 @@ def _weighed(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> MapPro
     widened, sources = _sources(problem, now)
     if sources is None:
         return problem
-    estimated = sources.of_aspect(widened, snapshot.errors)
     shown = 1.0 / sources.system.covariance[0, 0] - problem.lens_information
     gain = shown / (shown + problem.lens_information)
-    best = min(gain**2 / max(float(np.mean(estimated**2)), TINY), 1.0 - TINY)
+    best = min(gain**2 / max(sources.variance_of_aspect(widened, snapshot.errors), TINY), 1.0 - TINY)
     return replace(problem, lens_information=shown * (1.0 / best - 1.0)) if best > TINY else problem
 
 

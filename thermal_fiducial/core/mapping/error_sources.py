@@ -4,7 +4,6 @@ Two markers that are seen in the same frames have nearly the same error, which a
 of all markers together do: the error of a pose by several markers is its derivative times theirs, draw by draw.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ from thermal_fiducial.core.error_model import (
     arms_of_scale,
     covariance_by_draws,
     covariance_root,
+    drawn_sum,
     DRAWS,
     scale_of_map,
     shape_of_corners,
@@ -22,13 +22,7 @@ from thermal_fiducial.core.error_model import (
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem
 from thermal_fiducial.core.mapping.normal_equations import BorderedSystem, Vectors
-from thermal_fiducial.core.types import FloatArray
-
-#: Draws that are propagated at a time, which bounds the memory.
-_AT_ONCE = 32
-_SOME_DRAWS = [slice(first, first + _AT_ONCE) for first in range(0, DRAWS, _AT_ONCE)]
-#: Right sides of the normal equations for some of the draws.
-DrawnSides = Callable[[slice], Vectors]
+from thermal_fiducial.core.types import FloatArray, IntArray
 
 
 class MapErrors(NamedTuple):
@@ -61,68 +55,75 @@ class ErrorSources:
         known : (M, 6, K) draws of the held markers; others are not used
         """
         system, problem, positions = self.system, self.problem, self.now.state.T_map_marker[:, :3, 3]
-        by_corners, by_noise = self._solved(self._lasting(errors)), self._solved(self._noise(widened))
+        by_corners = system.solve(self._lasting(errors))
         by_held = system.by_held(np.concatenate([known, np.zeros_like(known[:1])]))
-        # By noise alone: the error of the aspect ratio is among the lasting ones.
-        noise_of_common = system.covariance - problem.lens_information * system.covariance @ system.covariance
-        covariances = widened * system.covariances(noise_of_common)[:-1]
+        common = covariance_root(self._noise_of_common) @ self.rng.standard_normal((len(by_corners.common), DRAWS))
+        by_noise = np.sqrt(widened) * system.drawn(common, self.rng)
+        covariances = widened * system.covariances(self._noise_of_common)[:-1]
         covariances += covariance_by_draws(by_corners.nodes[:-1]) + covariance_by_draws(by_held.nodes[:-1])
         covariances += scale_of_map(arms_of_scale(positions, positions[problem.anchors]), errors)
-        nodes = by_corners.nodes + by_noise.nodes + by_held.nodes
-        common = by_corners.common + by_noise.common + by_held.common
-        lens = LensErrors(problem.corners[:1], problem.cameras[problem.lens], errors)
-        return MapErrors(covariances, nodes[:-1], lens.aspect_draws - common[0])
+        draws = by_corners.nodes + by_noise + by_held.nodes
+        found = by_corners.common + np.sqrt(widened) * common + by_held.common
+        aspect = LensErrors(problem.corners[:1], problem.cameras[problem.lens], errors).aspect_draws
+        return MapErrors(covariances, draws[:-1], aspect - found[0])
 
-    def of_aspect(self, widened: float, errors: SystematicErrors) -> FloatArray:
-        """Some draws of what is estimated of the aspect ratio's error, by itself, noise and all other errors."""
-        some = _SOME_DRAWS[0]
-        of_all = (self.system.common(sides(some))[0] for sides in (self._lasting(errors), self._noise(widened)))
-        return np.asarray(sum(of_all))
+    def variance_of_aspect(self, widened: float, errors: SystematicErrors) -> float:
+        """Of what is estimated of the aspect ratio's error, by itself, noise and all other errors."""
+        problem, now, moved = self.problem, self.now, self.system.moved
+        of_cameras = np.swapaxes(now.to_camera, -1, -2) @ moved.frames[problem.frame]
+        gains = self._by_corners(problem.J_lens - now.J @ (moved.nodes[problem.marker] + of_cameras))
+        of_shapes = np.sum(problem.over_markers(gains) ** 2, axis=(1, 2, 3)) @ self._shapes(errors) ** 2
+        of_lenses = 0.0
+        for index, camera in enumerate(problem.cameras):
+            own = problem.camera == index
+            of_lenses += (
+                LensErrors(problem.corners[own], camera, errors).covariance(gains[own].reshape(-1, 1, 2)).item()
+            )
+        noise = widened * self._noise_of_common[0, 0]
+        return float(self.system.covariance[0, 0] ** 2 * (of_shapes + of_lenses) + noise)
 
-    def _noise(self, widened: float) -> DrawnSides:
-        """Of noise of corners and priors."""
-        problem, roots = self.problem, np.sqrt(widened * self.weights)[:, None, None]
-        of_frame = np.sqrt(widened) * covariance_root(problem.odometry.weighted(self.now.camera_chi2))
-        of_marker = np.sqrt(widened) * covariance_root(problem.known.weighted(self.now.marker_chi2))
+    @property
+    def _noise_of_common(self) -> FloatArray:
+        """Covariance (L, L) by noise alone: the error of the aspect ratio is among the lasting ones."""
+        covariance = self.system.covariance
+        return np.asarray(covariance - self.problem.lens_information * covariance @ covariance)
 
-        def sides(_: slice) -> Vectors:
-            of_views = roots * self._normal(len(roots), 8)
-            of_odometry = of_frame @ self._normal(len(of_frame), 6)
-            return problem.sides(self.now, of_views, of_odometry, of_marker @ self._normal(len(of_marker), 6))
-
-        return sides
-
-    def _lasting(self, errors: SystematicErrors) -> DrawnSides:
-        """Of corner errors that are the same in all views of a marker, and by those of the lens.
+    def _lasting(self, errors: SystematicErrors) -> Vectors:
+        """Right sides by corner errors that are the same in all views of a marker, and by those of the lens.
 
         They do not average out and leave no residuals: the shape of a fixed marker rotates the whole map, and a lens
         that is wrong bends it.
         """
-        problem, weights = self.problem, self.weights[:, None, None]
-        shapes = self._shapes(errors)[:, None, None, None]
-        views = [problem.camera == index for index in range(len(problem.cameras))]
-        lenses = [
-            LensErrors(problem.corners[own], camera, errors) for own, camera in zip(views, problem.cameras, strict=True)
-        ]
+        problem, now = self.problem, self.now
+        shapes = self._shapes(errors)[:, None, None] * self.rng.standard_normal((len(problem.ids), 8, DRAWS))
+        # What is common has its part of each keyframe's views, too.
+        J_frame = np.concatenate([now.J @ np.swapaxes(now.to_camera, -1, -2), problem.J_lens], axis=-1)
+        of_frames, of_markers = self._by_corners(J_frame), self._by_corners(now.J)
+        frames = self._by_lenses(of_frames, problem.frame, len(problem.stamps), errors)
+        nodes = self._by_lenses(of_markers, problem.marker, len(problem.ids), errors)
+        # Each marker has one shape, and a keyframe many markers.
+        nodes += np.swapaxes(problem.over_markers(of_markers), 1, 2).reshape(len(nodes), 6, 8) @ shapes
+        of_views = np.swapaxes(of_frames, 1, 2).reshape(len(of_frames), -1, 8)
+        starts = np.flatnonzero(np.diff(problem.frame))
+        for frame, views in enumerate(np.split(np.arange(len(of_views)), starts + 1)):
+            frames[frame] += drawn_sum(of_views[views], shapes[problem.marker[views]])
+        return Vectors(frames[:, :6], np.concatenate([nodes, np.zeros_like(nodes[:1])]), frames[:, 6:].sum(axis=0))
 
-        no_priors = [np.zeros((number, 6, _AT_ONCE)) for number in (len(problem.stamps), len(problem.ids))]
+    def _by_lenses(self, gains: FloatArray, of: IntArray, count: int, errors: SystematicErrors) -> FloatArray:
+        """Draws (count, m, K) by the lenses, of what has derivatives (n, 4, m, 2): sums over views ``of`` (n,) each."""
+        problem, result = self.problem, np.zeros((count, gains.shape[2], DRAWS))
+        for index, camera in enumerate(problem.cameras):
+            own = np.flatnonzero(problem.camera == index)
+            own = own[np.argsort(of[own], kind='stable')]
+            some, starts = np.unique(of[own], return_index=True)
+            lens = LensErrors(problem.corners[own], camera, errors)
+            result[some] += lens.drawn_sums(gains[own].reshape(4 * len(own), -1, 2), 4 * starts)
+        return result
 
-        def sides(chosen: slice) -> Vectors:
-            off = (shapes * self._normal(len(shapes), 4, 2))[problem.marker]
-            for own, lens in zip(views, lenses, strict=True):
-                off[own] += lens.drawn(chosen)
-            of_views = weights * (problem.W @ off).reshape(-1, 8, _AT_ONCE)
-            return problem.sides(self.now, of_views, *no_priors)
-
-        return sides
-
-    def _solved(self, sides: DrawnSides) -> Vectors:
-        """Errors of all unknowns."""
-        parts = zip(*(self.system.solve(sides(some)) for some in _SOME_DRAWS), strict=True)
-        return Vectors(*(np.concatenate(part, axis=-1) for part in parts))
-
-    def _normal(self, *shape: int) -> FloatArray:
-        return self.rng.standard_normal((*shape, _AT_ONCE))
+    def _by_corners(self, J: FloatArray) -> FloatArray:
+        """Derivatives (n, 4, m, 2) of right sides by errors of the corners [1/px], from whitened ones (n, 8, m)."""
+        weighted = (self.weights[:, None, None] * J).reshape(len(J), 4, 2, -1)
+        return np.asarray(np.swapaxes(weighted, -1, -2) @ self.problem.W)
 
     def _shapes(self, errors: SystematicErrors) -> FloatArray:
         """Standard deviations (M,) [px] of corner errors that are the same in all views of a marker."""

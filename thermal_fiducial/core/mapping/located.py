@@ -9,7 +9,6 @@ import numpy as np
 from thermal_fiducial.core.error_model import (
     arms_of_scale,
     drawn_sum,
-    DRAWS,
     INCONSISTENT_PX,
     NO_DRAWS,
 )
@@ -150,8 +149,7 @@ class Location:
     @property
     def viewpoint(self) -> Viewpoint:
         """The camera as viewpoint of new markers: all but its noise is common to all views."""
-        of_corners = self.lens.drawn().reshape(-1, 2, DRAWS)
-        draws = drawn_sum(self.corner_gains, of_corners) + drawn_sum(self.map_gains, self.sight.draws)
+        draws = self.lens.drawn_sum(self.corner_gains) + drawn_sum(self.map_gains, self.sight.draws)
         return Viewpoint.known(self.pose.T_map_camera, self.noise, draws, self.of_sides)
 
 

@@ -188,9 +188,9 @@ class MarkerViews:
         white = np.linalg.inv(np.einsum('vri,vrj->ij', J_marker, J_marker))
         gains = -white @ np.einsum('vri,vrj->vij', J_marker, J_camera)
         by_corner = white @ np.swapaxes(J_marker, -1, -2) @ fits.W
-        of_lens = self._of_lens.drawn().reshape(-1, 8, DRAWS)
         of_sides = np.einsum('vij,vj->i', gains, self._of_sides)
-        shared = drawn_sum(gains, self._draws[own]) + drawn_sum(by_corner, of_lens)
+        of_lens = self._of_lens.drawn_sum(by_corner.reshape(-1, 6, 4, 2).swapaxes(1, 2).reshape(-1, 6, 2))
+        shared = drawn_sum(gains, self._draws[own]) + of_lens
         alone = independent_sum(by_corner, self._noise) + independent_sum(gains, self._camera_noise[own])
         alone *= noise
         of_noise = np.linalg.cholesky(alone) @ rng.standard_normal((6, DRAWS))

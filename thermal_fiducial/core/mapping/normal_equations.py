@@ -1,9 +1,8 @@
 """Normal equations of a bundle adjustment over keyframes and nodes: Schur complement, solution, covariances."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -12,10 +11,12 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 # Unknowns up to which a dense factorisation is faster than a sparse one.
 _DENSE = 1500
-# Entries of the inverse that are computed at a time: all of a dense one.
-_ENTRIES = _DENSE**2
-# Share of the markers that a keyframe sees from which a dense product is faster than a sparse one.
-_FULL = 0.15
+# Entries of the inverse of a sparse matrix that are computed at a time.
+_ENTRIES = 1500**2
+# Successive keyframes, which see nearly the same markers, whose products are computed at a time.
+_TOGETHER = 48
+# Size up to which numpy inverts triangular matrices as fast as it can.
+_SMALL = 64
 
 
 class Vectors(NamedTuple):
@@ -63,33 +64,140 @@ class NormalEquations:
         """The system of the nodes alone, factorised; None where it is singular."""
         try:
             root = np.linalg.inv(np.linalg.cholesky(_damped(blocks.frame, damping)))
-            coupling, matrix = self._schur(root[self._frame] @ blocks.cross[self._order], _damped(blocks.node, damping))
+            cross = root[self._frame] @ blocks.cross[self._order]
+            coupling, node = self._coupling(cross), _damped(blocks.node, damping)
+            dense = node.size <= 6 * _DENSE
+            matrix = coupling.schur(node) if dense else self._sparse_schur(cross, node)
             free = np.flatnonzero(np.repeat(~self._held, 6))
-            apart = ReducedSystem(root, coupling, matrix, _solver(matrix[free][:, free]), self._held)
-            return BorderedSystem.of(apart, blocks.common)
+            own = matrix[free][:, free]
+            factor: _Factor = _DenseFactor.of(own) if dense else _SparseFactor.of(own)
+            return BorderedSystem.of(ReducedSystem(root, coupling, matrix, factor, self._held), blocks.common)
         except (RuntimeError, ValueError, np.linalg.LinAlgError):
             return None
 
-    def _schur(self, cross: FloatArray, own: FloatArray) -> tuple[Any, Any]:
-        """Coupling (6 F, 6 M) of keyframes and nodes, and Schur complement (6 M, 6 M); sparse in large maps.
+    def _coupling(self, cross: FloatArray) -> 'Coupling':
+        """Keyframes and nodes by the blocks (n, 6, 6) of their connections, ordered by keyframe."""
+        parts = []
+        for first, end in pairwise([*range(0, self._frames, _TOGETHER), self._frames]):
+            some = slice(self._starts[first], self._starts[end])
+            nodes, place = np.unique(self._node[some], return_inverse=True)
+            cells = np.zeros((end - first, 6, len(nodes), 6))
+            cells[self._frame[some] - first, :, place] = cross[some]
+            columns = (6 * nodes[:, None] + np.arange(6)).ravel()
+            parts.append((slice(6 * first, 6 * end), columns, cells.reshape(-1, len(columns))))
+        return Coupling(parts)
 
-        Parameters
-        ----------
-        cross, own : (n, 6, 6), (M, 6, 6) blocks of the connections, ordered by keyframe, and of the nodes
-        """
-        frames, each = self._frames, np.arange(len(own))
-        if len(cross) > _FULL * frames * len(own):
-            cells, blocks = np.zeros((frames, 6, len(own), 6)), np.zeros((len(own), 6, len(own), 6))
-            cells[self._frame, :, self._node] = cross
-            blocks[each, :, each] = own
-            coupling = cells.reshape(6 * frames, -1)
-            return coupling, blocks.reshape(6 * len(own), -1) - coupling.T @ coupling
+    def _sparse_schur(self, cross: FloatArray, own: FloatArray) -> Any:
+        """As :meth:`Coupling.schur`, for a large map."""
         # Only here, as its import takes 30 MB.
         from scipy.sparse import bsr_array
 
-        sparse: Any = bsr_array((cross, self._node, self._starts), shape=(6 * frames, 6 * len(own)))
-        reduced = bsr_array((own, each, np.arange(len(own) + 1))).tocsr() - sparse.T @ sparse
-        return sparse, reduced.toarray() if reduced.shape[0] <= _DENSE else reduced
+        each, shape = np.arange(len(own) + 1), (6 * self._frames, 6 * len(own))
+        sparse: Any = bsr_array((cross, self._node, self._starts), shape=shape)
+        return bsr_array((own, each[:-1], each)).tocsr() - sparse.T @ sparse
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """A matrix (6 F, 6 M) of keyframes and nodes."""
+
+    #: of some successive keyframes: rows, columns of the nodes that any of them is connected with, and what is there
+    parts: list[tuple[slice, IntArray, FloatArray]]
+
+    def times(self, nodes: FloatArray) -> FloatArray:
+        """Product (6 F, K) with vectors (6 M, K)."""
+        return np.concatenate([cells @ nodes[columns] for _, columns, cells in self.parts])
+
+    def taken_off(self, nodes: FloatArray, frames: FloatArray) -> FloatArray:
+        """Vectors ``nodes`` (6 M, K) less the product of the transpose with ``frames`` (6 F, K)."""
+        left = nodes.copy()
+        for rows, columns, cells in self.parts:
+            left[columns] -= cells.T @ frames[rows]
+        return left
+
+    def schur(self, own: FloatArray) -> FloatArray:
+        """Schur complement (6 M, 6 M): blocks (M, 6, 6) of the nodes less the product of the transpose with this."""
+        blocks, each = np.zeros((len(own), 6, len(own), 6)), np.arange(len(own))
+        blocks[each, :, each] = own
+        matrix = blocks.reshape(6 * len(own), -1)
+        for _, columns, cells in self.parts:
+            matrix[np.ix_(columns, columns)] -= cells.T @ cells
+        return matrix
+
+
+class _Factor(Protocol):
+    """A factorised positive definite matrix (m, m) of nodes."""
+
+    def solve(self, sides: FloatArray) -> FloatArray:
+        """Solutions (m, K)."""
+        ...
+
+    def drawn(self, normal: FloatArray) -> FloatArray:
+        """Draws (m, K) of errors whose covariance is the inverse, by ``normal`` (m, K) of independent variables."""
+        ...
+
+    def covariances(self) -> FloatArray:
+        """Blocks (m / 6, 6, 6) on the diagonal of the inverse."""
+        ...
+
+
+@dataclass(frozen=True)
+class _DenseFactor:
+    """By the inverse of its Cholesky factor."""
+
+    root: FloatArray
+
+    @classmethod
+    def of(cls, S: FloatArray) -> '_DenseFactor':
+        """LinAlgError if it is not positive definite."""
+        return cls(inverse_of_triangular(np.asarray(np.linalg.cholesky(S))))
+
+    def solve(self, sides: FloatArray) -> FloatArray:
+        return np.asarray(self.root.T @ (self.root @ sides))
+
+    def drawn(self, normal: FloatArray) -> FloatArray:
+        return np.asarray(self.root.T @ normal)
+
+    def covariances(self) -> FloatArray:
+        roots = self.root.T.reshape(-1, 6, len(self.root))
+        return np.asarray(roots @ np.swapaxes(roots, -1, -2))
+
+
+@dataclass(frozen=True)
+class _SparseFactor:
+    """By sparse triangular ones."""
+
+    factors: Any
+
+    @classmethod
+    def of(cls, S: Any) -> '_SparseFactor':
+        """RuntimeError if it is singular."""
+        from scipy.sparse import csc_array
+        from scipy.sparse.linalg import splu
+
+        return cls(
+            splu(csc_array(S), permc_spec='MMD_AT_PLUS_A', options={'SymmetricMode': True}, diag_pivot_thresh=0.0)
+        )
+
+    def solve(self, sides: FloatArray) -> FloatArray:
+        return np.asarray(self.factors.solve(sides))
+
+    def drawn(self, normal: FloatArray) -> FloatArray:
+        # The matrix in another order is L D L', and D what is on the diagonal of the upper factor.
+        permuted = self.factors.L @ (np.sqrt(np.abs(self.factors.U.diagonal()))[:, None] * normal)
+        return self.solve(permuted[self.factors.perm_r])
+
+    def covariances(self) -> FloatArray:
+        size = self.factors.shape[0]
+        result = np.zeros((size // 6, 6, 6))
+        number = max(_ENTRIES // (6 * size), 1)
+        for first in range(0, len(result), number):
+            each = np.arange(min(number, len(result) - first))
+            unit = np.zeros((len(result), 6, len(each), 6))
+            unit[first + each, :, each] = np.eye(6)
+            inverse = self.solve(unit.reshape(size, -1)).reshape(unit.shape)
+            result[first + each] = inverse[first + each, :, each]
+        return np.asarray(0.5 * (result + np.swapaxes(result, -1, -2)))
 
 
 @dataclass(frozen=True)
@@ -98,11 +206,11 @@ class ReducedSystem:
 
     #: (F, 6, 6) inverse Cholesky factors of the keyframes' blocks
     root: FloatArray
-    #: (6 F, 6 M) these factors times the cross blocks of keyframes and nodes
-    coupling: Any
-    #: (6 M, 6 M) Schur complement, and what solves its part of the m free nodes for right sides (6 m, K)
+    #: these factors times the cross blocks of keyframes and nodes
+    coupling: Coupling
+    #: (6 M, 6 M) Schur complement, sparse in large maps, and its part of the free nodes
     matrix: Any
-    solve_free: Callable[[FloatArray], FloatArray]
+    factor: _Factor
     #: (M,)
     held: BoolArray
 
@@ -110,33 +218,35 @@ class ReducedSystem:
         """Solutions (F, 6, K) and (M, 6, K) for right sides of the same shapes."""
         count = of_frames.shape[-1]
         sides = (self.root @ of_frames).reshape(-1, count)
-        remaining = (of_nodes.reshape(-1, count) - self.coupling.T @ sides).reshape(of_nodes.shape)
-        nodes = np.zeros_like(of_nodes)
-        nodes[~self.held] = self.solve_free(remaining[~self.held].reshape(-1, count)).reshape(-1, 6, count)
-        left = sides - self.coupling @ nodes.reshape(-1, count)
+        remaining = self.coupling.taken_off(of_nodes.reshape(-1, count), sides).reshape(of_nodes.shape)
+        nodes = self._of_free(self.factor.solve(remaining[~self.held].reshape(-1, count)))
+        left = sides - self.coupling.times(nodes.reshape(-1, count))
         return np.swapaxes(self.root, -1, -2) @ left.reshape(of_frames.shape), nodes
 
     def covariances(self) -> FloatArray:
         """Covariances (M, 6, 6) of the nodes by noise."""
-        free, result = np.flatnonzero(~self.held), np.zeros((len(self.held), 6, 6))
-        number = max(_ENTRIES // (36 * len(free)), 1)
-        for first in range(0, len(free), number):
-            some = free[first : first + number]
-            unit = np.zeros((len(free), 6, len(some), 6))
-            each = np.arange(len(some))
-            unit[first + each, :, each] = np.eye(6)
-            inverse = self.solve_free(unit.reshape(6 * len(free), -1)).reshape(unit.shape)
-            result[some] = inverse[first + each, :, each]
-        return 0.5 * (result + np.swapaxes(result, -1, -2))
+        result = np.zeros((len(self.held), 6, 6))
+        result[~self.held] = self.factor.covariances()
+        return result
+
+    def drawn(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """``count`` draws (M, 6, K) of the nodes' errors by noise."""
+        return self._of_free(self.factor.drawn(rng.standard_normal((6 * np.count_nonzero(~self.held), count))))
 
     def by_held(self, drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Errors (F, 6, K) and (M, 6, K) of all by those of the held nodes, of ``drawn`` (M, 6, K)."""
         free, result, count = ~self.held, np.where(self.held[:, None, None], drawn, 0.0), drawn.shape[-1]
         if result.any():
             moved = (self.matrix @ result.reshape(-1, count)).reshape(result.shape)
-            result[free] = -self.solve_free(moved[free].reshape(-1, count)).reshape(result[free].shape)
-        frames = -(self.coupling @ result.reshape(-1, count)).reshape(-1, 6, count)
+            result[free] = -self.factor.solve(moved[free].reshape(-1, count)).reshape(result[free].shape)
+        frames = -self.coupling.times(result.reshape(-1, count)).reshape(-1, 6, count)
         return np.swapaxes(self.root, -1, -2) @ frames, np.asarray(result)
+
+    def _of_free(self, values: FloatArray) -> FloatArray:
+        """Of all nodes (M, 6, K) by those (m, K) of the free ones."""
+        nodes = np.zeros((len(self.held), 6, values.shape[-1]))
+        nodes[~self.held] = values.reshape(-1, 6, values.shape[-1])
+        return nodes
 
 
 @dataclass(frozen=True)
@@ -162,9 +272,9 @@ class BorderedSystem:
         """Solutions for right sides of the same shapes."""
         return self._with_common(*self.apart.solve(sides.frames, sides.nodes), sides.common)
 
-    def common(self, sides: Vectors) -> FloatArray:
-        """The part (L, K) of :meth:`solve` that is of what is common: the equations are symmetric."""
-        return np.asarray(self.covariance @ (sides.common - sides.dot(self.moved)))
+    def drawn(self, common: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Draws (M, 6, K) of the nodes' errors by noise, with those (L, K) of what is ``common``."""
+        return self.apart.drawn(rng, common.shape[-1]) - self.moved.nodes @ common
 
     def covariances(self, of_common: FloatArray) -> FloatArray:
         """Covariances (M, 6, 6) of the nodes, with that (L, L) of what is common."""
@@ -188,16 +298,13 @@ def _damped(H: FloatArray, damping: float) -> FloatArray:
     return np.asarray(H + (damping * diagonal + floor)[..., None] * np.eye(6))
 
 
-def _solver(S: Any) -> Callable[[FloatArray], FloatArray]:
-    """What solves with a positive definite matrix; LinAlgError if a small one is not, RuntimeError if singular."""
-    if isinstance(S, np.ndarray):
-        np.linalg.cholesky(S)
-        return partial(np.linalg.solve, S)
-    from scipy.sparse import csc_array
-    from scipy.sparse.linalg import splu
-
-    options = {'SymmetricMode': True}
-    solve: Callable[[FloatArray], FloatArray] = splu(
-        csc_array(S), permc_spec='MMD_AT_PLUS_A', options=options, diag_pivot_thresh=0.0
-    ).solve
-    return solve
+def inverse_of_triangular(L: FloatArray) -> FloatArray:
+    """Inverse of a lower triangular matrix (m, m), by halves: numpy's for any matrix takes several times as long."""
+    half = len(L) // 2
+    if half < _SMALL:
+        return np.asarray(np.linalg.inv(L))
+    inverse, first, second = np.zeros_like(L), slice(half), slice(half, None)
+    inverse[first, first] = inverse_of_triangular(L[first, first])
+    inverse[second, second] = inverse_of_triangular(L[second, second])
+    inverse[second, first] = -inverse[second, second] @ (L[second, first] @ inverse[first, first])
+    return inverse
