@@ -230,18 +230,18 @@ class MapProblem:
     def evaluate(self, state: Poses) -> Linearised:
         """Whitened residuals and derivatives."""
         n = len(self.frame)
-        T_map_camera, T_map_marker = state.T_map_camera[self.frame], state.T_map_marker[self.marker]
+        T_camera_map, T_map_marker = inverse(state.T_map_camera)[self.frame], state.T_map_marker[self.marker]
         corners = marker_corners(self.sizes)[self.marker]
-        off, J, seen = linearised(inverse(T_map_camera) @ T_map_marker, corners, self.images)
+        off, J, seen = linearised(T_camera_map @ T_map_marker, corners, self.images)
         # From the axes of the camera to those of the map.
-        R_camera_map = np.ascontiguousarray(T_map_camera[:, :3, :3].swapaxes(-1, -2))
-        J = (J.reshape(n, 16, 3) @ R_camera_map).reshape(n, 8, 6)
+        J = (J.reshape(n, 16, 3) @ T_camera_map[:, :3, :3]).reshape(n, 8, 6)
         r = -off.reshape(n, 8) - self.J_lens @ state.lens
         # Markers behind the camera have no gradient, and the cost of an outlier.
         r[~seen], J[~seen] = 0.0, 0.0
         chi2 = np.where(seen, np.sum(r * r, axis=-1), BEHIND_CHI2)
         # Moved like the camera, but the other way round.
-        to_camera = -lever_arm(T_map_marker[:, :3, 3] - T_map_camera[:, :3, 3]).swapaxes(-1, -2)
+        arms = T_map_marker[:, :3, 3] - state.T_map_camera[self.frame, :3, 3]
+        to_camera = -lever_arm(arms).swapaxes(-1, -2)
         J_odometry = lever_arm(self.odometry.T[:, :3, 3] @ state.T_map_odometry[:3, :3].T)
         of_cameras = self.odometry.moved(state.T_map_odometry).apart(state.T_map_camera)
         of_markers = self.known.apart(state.T_map_marker)
@@ -318,43 +318,32 @@ class MapProblem:
 
     def normal(self, now: Linearised, scale: float) -> tuple[Blocks, Vectors]:
         """Normal equations, and their right sides."""
-        weights = now.weights(scale)[:, None, None]
+        weights, count = now.weights(scale)[:, None, None], self.J_lens.shape[-1]
+        # What the poses' derivatives are multiplied with beside each other: the lens's, and the residuals.
+        beside = np.concatenate([self.J_lens, now.r[..., None]], axis=-1)
         of_marker = weights * np.swapaxes(now.J, -1, -2)
-        node, by_lens = of_marker @ now.J, of_marker @ self.J_lens
+        node, by_marker = of_marker @ now.J, of_marker @ beside
         cross = now.to_camera @ node
+        of_frames, of_markers = self.over_frames(now.to_camera @ by_marker), self.over_markers(by_marker)
+        of_lens = np.tensordot(weights * self.J_lens, beside, axes=([0, 1], [0, 1]))
         odometry, known = self.odometry.weighted(now.camera_chi2), self.known.weighted(now.marker_chi2)
-        of_camera_by_odometry = odometry @ now.J_odometry
-        of_odometry = np.swapaxes(now.J_odometry, -1, -2) @ of_camera_by_odometry
-        count = self.J_lens.shape[-1]
-        lens = (np.sqrt(weights) * self.J_lens).reshape(-1, count)
+        by_odometry, back = odometry @ now.J_odometry, np.swapaxes(now.J_odometry, -1, -2)
         blocks = Blocks(
             frame=self.over_frames(cross @ np.swapaxes(now.to_camera, -1, -2)) + odometry,
-            node=_with_odometry(self.over_markers(node) + known, of_odometry),
-            cross=np.concatenate([cross, -of_camera_by_odometry]),
+            node=_with_odometry(self.over_markers(node) + known, back @ by_odometry),
+            cross=np.concatenate([cross, -by_odometry]),
             common=Vectors(
-                self.over_frames(now.to_camera @ by_lens),
-                _with_odometry(self.over_markers(by_lens), np.zeros((1, 6, count))),
-                lens.T @ lens + self.lens_information * np.eye(count),
+                of_frames[..., :-1],
+                _with_odometry(of_markers[..., :-1], np.zeros((1, 6, count))),
+                of_lens[:, :-1] + self.lens_information * np.eye(count),
             ),
         )
-        of_priors = odometry @ now.camera_apart[..., None], known @ now.marker_apart[..., None]
-        sides = self.sides(now, weights * now.r[..., None], *of_priors)
-        return blocks, sides._replace(common=sides.common - self.lens_information * now.state.lens[:, None])
-
-    def sides(self, now: Linearised, of_views: FloatArray, of_odometry: FloatArray, of_known: FloatArray) -> Vectors:
-        """Right sides of the normal equations, without the priors of the lens.
-
-        Parameters
-        ----------
-        of_views : (n, 8, k) weighted residuals
-        of_odometry, of_known : (F, 6, k), (M, 6, k) information times differences from the priors
-        """
-        of_markers = np.swapaxes(now.J, -1, -2) @ of_views
-        back = -np.swapaxes(now.J_odometry, -1, -2) @ of_odometry
-        return Vectors(
-            self.over_frames(now.to_camera @ of_markers) + of_odometry,
-            _with_odometry(self.over_markers(of_markers) + of_known, back),
-            np.tensordot(self.J_lens, of_views, axes=([0, 1], [0, 1])),
+        of_odometry = odometry @ now.camera_apart[..., None]
+        of_known = known @ now.marker_apart[..., None]
+        return blocks, Vectors(
+            of_frames[..., -1:] + of_odometry,
+            _with_odometry(of_markers[..., -1:] + of_known, -back @ of_odometry),
+            of_lens[:, -1:] - self.lens_information * now.state.lens[:, None],
         )
 
     def over_frames(self, values: FloatArray) -> FloatArray:
