@@ -27,9 +27,9 @@ _CELL = 0.25
 _THINNED = 0.85
 # A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
 _GROWTH, _FEW = 0.2, 15
-#: Views of markers that a refinement in flight takes: a second or two of a slow core.
+#: Views of markers that a refinement in flight takes: half a second or one of a slow core.
 VIEWS = 10_000
-# Time between two refinements for each view of the last [s]: a view takes a third of it on a slow core. With three
+# Time between two refinements for each view of the last [s]: a view takes a fifth of it on a slow core. With three
 # times as much, poses from markers just placed along a chain were too vague to publish: 19 of 633 over a carpet.
 _PERIOD_A_VIEW = 3e-4
 
