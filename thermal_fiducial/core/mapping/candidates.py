@@ -3,7 +3,7 @@
 A small square seen from one side fits two poses nearly equally well (the planar ambiguity of Schweighofer and Pinz,
 "Robust pose estimation from a planar target", 2006). The wrong pose differs between directions, so the marker's pose is
 fitted to views from several directions, starting from either solution. The marker enters the map once one of the two
-fits is ruled out.
+fits is ruled out, unless the views show that its side is not the declared one.
 """
 
 from collections.abc import Mapping
@@ -32,6 +32,8 @@ MAX_VIEWS = 16
 UNAMBIGUOUS = 25.0
 #: Mean chi square of a view (8 residuals) above which the views cannot be of one marker at rest.
 INCONSISTENT = 200.0
+#: Chi square of the declared side, by the views, above which it is wrong: 99.9 % quantile, one degree of freedom.
+WRONG_SIDE = 10.8
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
 #: Largest number of candidates, which bounds memory against false positives: those observed longest ago are dropped.
@@ -84,7 +86,7 @@ class Candidate:
             return f'marker {self.id} needs views from more directions'
         views = MarkerViews(self.views, self.size, camera, errors)
         fits = views.fit(self._starts)
-        if not fits.chi2[0] <= INCONSISTENT * len(self.views):
+        if not fits.chi2[0] <= INCONSISTENT * len(self.views) or views.chi2_of_side(fits) > WRONG_SIDE:
             if len(self.views) >= 2 * MIN_VIEWS:
                 self._drop_farthest()
             return f'marker {self.id}: its views contradict each other; is its side {self.size:g} m?'

@@ -13,12 +13,13 @@ from thermal_fiducial.core.error_model import (
     drawn_sum,
     DRAWS,
     independent_sum,
+    noise_factor,
     SystematicErrors,
     with_corner_errors,
 )
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.reprojection import linearise
-from thermal_fiducial.core.geometry.rigid_fit import minimise, Quadratic
+from thermal_fiducial.core.geometry.reprojection import linearise, marker_corners
+from thermal_fiducial.core.geometry.rigid_fit import minimise, Quadratic, SINGULAR
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -143,7 +144,7 @@ class MarkerViews:
     """n views of one marker as arrays."""
 
     def __init__(self, views: Sequence[MarkerView], size: float, camera: Camera, errors: SystematicErrors) -> None:
-        self._camera, self._size = camera, size
+        self._camera, self._size, self._side_std = camera, size, errors.marker_size_std
         corners = np.stack([view.corners for view in views])
         self._corners, self._of_lens = corners.reshape(-1, 8), LensErrors(corners, camera, errors)
         covariances = np.stack([view.corner_covariances for view in views])
@@ -195,6 +196,29 @@ class MarkerViews:
         alone *= noise
         of_noise = np.linalg.cholesky(alone) @ rng.standard_normal((6, DRAWS))
         return alone + covariance_of_one_error(of_sides) + covariance_by_draws(shared), shared + of_noise
+
+    def chi2_of_side(self, fits: FittedPoses) -> float:
+        """Chi square, one degree of freedom, of the declared side against the one that the views show.
+
+        One view allows any side: a marker of twice the side is twice as far away. Cameras that are known better than
+        they are apart show the range by themselves. The side is a seventh unknown, one step from the best fit, and its
+        variance has the noise of the residuals that this leaves. As well as it is declared a side need not be right:
+        that of this marker, and those of the markers that the cameras are known by.
+        """
+        own = np.arange(len(fits.chosen)), fits.chosen
+        r, _, J_marker = (of_best[0] for of_best in self._linearised(fits.T[:1], self._T_map_camera[own][None]))
+        from_centre = marker_corners(self._size) @ fits.T[0, :3, :3].T
+        by_side = np.einsum('vcij,cj->vci', J_marker[..., :3].reshape(-1, 4, 2, 3), from_centre).reshape(-1, 8)
+        white = (fits.W @ np.concatenate([J_marker, by_side[..., None], r[..., None]], axis=-1)).reshape(-1, 8)
+        # What a pose may explain of side and residuals says nothing of the side.
+        Q = np.linalg.qr(white[:, :6])[0]
+        by_side, r = (white[:, 6:] - Q @ (Q.T @ white[:, 6:])).T
+        information, shown = float(by_side @ by_side), float(by_side @ r)
+        if information <= SINGULAR * float(white[:, 6] @ white[:, 6]):
+            return 0.0
+        noise = noise_factor(float(r @ r) - shown**2 / information, len(r) - 7)
+        variance = noise / information + 2.0 * self._side_std**2
+        return (shown / information) ** 2 / variance
 
     def _choose(self, T: FloatArray) -> IntArray:
         """The likelier of the two camera poses of each view, (S, n), for a marker at T."""

@@ -5,13 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.small_bag import CAMERA as STRAIGHT
+from support.walls import CAMERA as OF_WALL
+from support.walls import hung, look, see
+from support.walls import rows as rows_of
 
 from thermal_fiducial.core.error_model import covariance_by_draws, DRAWS, NO_DRAWS, SystematicErrors
-from thermal_fiducial.core.geometry.reprojection import lever_arm, marker_corners
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, marker_corners, retract
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
-from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers
-from thermal_fiducial.core.mapping.marker_views import MarkerView, Viewpoint
-from thermal_fiducial.core.measurements import NOTHING_KNOWN, Observations
+from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers, WRONG_SIDE
+from thermal_fiducial.core.mapping.marker_views import MarkerView, MarkerViews, Viewpoint
+from thermal_fiducial.core.measurements import corners_px, NOTHING_KNOWN, Observations
 
 # What lies far beside the axis a lens with distortion throws farthest.
 CAMERA = replace(STRAIGHT, D=np.array([-0.3, 0.12, 0.0, 0.0, -0.02]))
@@ -160,3 +163,73 @@ def test_a_camera_whose_turn_is_unknown_takes_nothing_from_a_claim():
         claims.append(np.sqrt(candidate.place(CAMERA, SystematicErrors()).covariance.trace()))
     # 4.7 and 3.3 mm: a turn of 10 degrees is beyond the first order. With the weights of the start alone 610 mm.
     assert claims[1] < 2.0 * claims[0]
+
+
+def from_cameras_in_doubt(seed, *, apart_deg, side=SIZE, distance=2.5):
+    """A marker of ``side``, taken for one of :data:`SIZE`, and where it is, (4, 4).
+
+    Three cameras see it, up to ``apart_deg`` apart, with corners of 0.1 px; each is known to 5 mm and 3.5 mrad.
+    """
+    rng, stds, candidate = np.random.default_rng(seed), np.repeat([5e-3, 3.5e-3], 3), Candidate(7, SIZE)
+    T_map_marker = hung(rng, [0.0, 0.0, 1.5], 0.0, 0.3)
+    centre = T_map_marker[:3, 3]
+    for k, bearing in enumerate(0.2 + np.deg2rad(apart_deg) * np.array([-0.5, 0.0, 0.5])):
+        T_map_camera = look(centre + distance * np.array([-np.cos(bearing), np.sin(bearing), 0.1]), centre)
+        seen = see(T_map_camera, {7: T_map_marker}, 0.1, rng, side)
+        own = Observations.of(rows_of(seen['id'], corners_px(seen), 0.1))
+        taken_for = retract(T_map_camera[None], stds * rng.normal(size=(1, 6)))[0]
+        viewpoint = Viewpoint.known(taken_for, np.diag(stds**2), NO_DRAWS)
+        candidate.add(MarkerView(k, viewpoint, own.corners[0], own.covariances[0], own.branches[0]))
+    assert len(candidate.views) == 3
+    return candidate, T_map_marker
+
+
+@pytest.mark.parametrize('apart_deg', [5.0, 10.0])
+@pytest.mark.parametrize('ratio', [0.5, 2.0 / 3.0, 1.5, 2.0])
+def test_by_views_that_show_the_side_no_marker_of_another_enters(ratio, apart_deg):
+    """Without the chi square of the side most enter: residuals are small beside what the cameras may be off."""
+    for seed in range(20):
+        candidate, _ = from_cameras_in_doubt(seed, apart_deg=apart_deg, side=ratio * SIZE)
+        reason = candidate.place(OF_WALL, SystematicErrors(corner_px=0.0))
+        assert reason == 'marker 7: its views contradict each other; is its side 0.3 m?'
+
+
+@pytest.mark.parametrize('distance', [2.5, 6.0])
+def test_markers_of_the_declared_side_enter_in_the_right_one_of_the_two_poses(distance):
+    entered = 0
+    for seed in range(40):
+        candidate, T_map_marker = from_cameras_in_doubt(seed, apart_deg=5.0, distance=distance)
+        marker = candidate.place(OF_WALL, SystematicErrors(corner_px=0.0))
+        if isinstance(marker, str):
+            assert 'ambiguity' in marker
+            continue
+        entered += 1
+        error = difference(T_map_marker, marker.T_map_marker)
+        # A chi square of six degrees of freedom exceeds it once in a million.
+        assert error @ np.linalg.solve(marker.covariance, error) < 38.3
+    # From 2.5 m one view settles it; from 6 m the two poses differ by little.
+    assert entered == 40 if distance < 5.0 else entered > 10
+
+
+def test_the_chi_square_of_a_right_side_is_one_in_the_mean():
+    exact = SystematicErrors(corner_px=0.0, marker_size_std=0.0)
+    values = []
+    for seed in range(100):
+        candidate, T_map_marker = from_cameras_in_doubt(seed, apart_deg=5.0)
+        views = MarkerViews(candidate.views, SIZE, OF_WALL, exact)
+        values.append(views.chi2_of_side(views.fit(T_map_marker[None])))
+    # The standard deviation of the mean is 0.14; beyond the gate are 0.1 % of them.
+    assert 0.5 < np.mean(values) < 1.5
+    assert np.count_nonzero(np.array(values) > WRONG_SIDE) <= 1
+
+
+def test_a_side_may_be_as_wrong_as_it_is_declared():
+    candidate, _ = from_cameras_in_doubt(0, apart_deg=10.0, side=1.5 * SIZE)
+    assert isinstance(candidate.place(OF_WALL, SystematicErrors(corner_px=0.0)), str)
+    assert not isinstance(candidate.place(OF_WALL, SystematicErrors(corner_px=0.0, marker_size_std=0.3)), str)
+
+
+def test_one_view_shows_no_side():
+    candidate, _ = from_cameras_in_doubt(0, apart_deg=10.0, side=1.5 * SIZE)
+    views = MarkerViews(candidate.views[:1], SIZE, OF_WALL, SystematicErrors())
+    assert views.chi2_of_side(views.fit(candidate.views[0].branches[:1])) == 0.0
