@@ -53,7 +53,7 @@ MECHANISMS = {
     'weights by the map': Mechanism(
         ('uneven map', 'chain'),
         ('joint_fit:JointFit.map_weights',),
-        {'joint_fit:JointFit.map_weights': lambda self, *_: np.ones(len(self.sight.markers))},
+        {'joint_fit:JointFit.map_weights': lambda self, *_: np.ones(len(self.sight.sizes))},
     ),
     'joint weights of surveyed markers': Mechanism(
         ('uneven map', 'surveyed board'),
