@@ -297,12 +297,12 @@ class MapProblem:
 
     def spread(self, most: int) -> BoolArray:
         """Which views (n,) are of at most so many of each marker, at equal distances among all of these."""
-        counts = np.bincount(self.marker, minlength=len(self.ids))
-        place = np.empty_like(self.marker)
-        place[np.argsort(self.marker, kind='stable')] = np.arange(len(place)) - np.repeat(
-            np.cumsum(counts) - counts, counts
-        )
-        return np.asarray(place % np.ceil(counts / most).astype(int)[self.marker] == 0)
+        order, starts = self._by_marker
+        counts = np.diff(starts, append=len(order))
+        place = np.arange(len(order)) - np.repeat(starts, counts)
+        chosen = np.empty(len(order), dtype=np.bool_)
+        chosen[order] = place % np.repeat(-(-counts // most), counts) == 0
+        return chosen
 
     @cached_property
     def equations(self) -> NormalEquations:
@@ -352,11 +352,16 @@ class MapProblem:
 
     def over_markers(self, values: FloatArray) -> FloatArray:
         """Sums (M, ...) over the views of each marker."""
-        order = np.argsort(self.marker, kind='stable')
-        starts = np.flatnonzero(np.diff(self.marker[order], prepend=-1))
+        order, starts = self._by_marker
         sums = np.zeros((len(self.ids), *values.shape[1:]))
         sums[self.marker[order[starts]]] = np.add.reduceat(values[order], starts, axis=0)
         return sums
+
+    @cached_property
+    def _by_marker(self) -> tuple[IntArray, IntArray]:
+        """Views (n,) ordered by marker, and where there those of each marker begin that has any."""
+        order = np.argsort(self.marker, kind='stable')
+        return order, np.flatnonzero(np.diff(self.marker[order], prepend=-1))
 
 
 def _with_odometry(of_markers: FloatArray, of_frames: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import noise_factor
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
-from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Poses, Snapshot
+from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Snapshot
 from thermal_fiducial.core.mapping.candidates import MAX_VIEWS, UNAMBIGUOUS
 from thermal_fiducial.core.mapping.error_sources import ErrorSources
 from thermal_fiducial.core.mapping.map_data import MapMarker
@@ -133,11 +133,11 @@ def _with_mirrored(problem: MapProblem, now: Linearised) -> Linearised | None:
     views are asked only of markers whose other pose is not ruled out by as many of them as place a new marker.
     """
     scale = _scale(now.chi2)
-    _, gains = _mirrored(problem.only(problem.spread(MAX_VIEWS)), now.state, scale)
+    _, gains = _mirrored(problem, now, problem.spread(MAX_VIEWS), scale)
     possible = ~problem.held & ~problem.known.information.any(axis=(1, 2)) & (gains > -UNAMBIGUOUS * scale)
     if not possible.any():
         return None
-    T_mirrored, gains = _mirrored(problem.only(possible[problem.marker]), now.state, scale)
+    T_mirrored, gains = _mirrored(problem, now, possible[problem.marker], scale)
     better = possible & (gains > UNAMBIGUOUS * scale)
     if not better.any():
         return None
@@ -145,13 +145,17 @@ def _with_mirrored(problem: MapProblem, now: Linearised) -> Linearised | None:
     return problem.evaluate(replace(now.state, T_map_marker=T_map_marker))
 
 
-def _mirrored(problem: MapProblem, state: Poses, scale: float) -> tuple[FloatArray, FloatArray]:
-    """Poses (M, 4, 4) of all markers mirrored and fitted each alone, and what this lowers the costs (M,) by."""
-    other = problem.mirrored(state)
+def _mirrored(problem: MapProblem, now: Linearised, views: BoolArray, scale: float) -> tuple[FloatArray, FloatArray]:
+    """Poses (M, 4, 4) of all markers mirrored and fitted each alone, and what this lowers the costs (M,) by.
+
+    Both by some of the ``views`` (n,).
+    """
+    by_some = problem.only(views)
+    other = by_some.mirrored(now.state)
     for _ in range(_MIRRORED_STEPS):
-        other = problem.markers_stepped(problem.evaluate(other), scale)
-    before, after = (problem.evaluate(poses).view_costs(scale) for poses in (state, other))
-    return other.T_map_marker, problem.over_markers(before - after)
+        other = by_some.markers_stepped(by_some.evaluate(other), scale)
+    gains = now.view_costs(scale)[views] - by_some.evaluate(other).view_costs(scale)
+    return other.T_map_marker, by_some.over_markers(gains)
 
 
 def _scale(chi2: FloatArray) -> float:

@@ -76,9 +76,8 @@ class ErrorSources:
         of_lenses = 0.0
         for index, camera in enumerate(problem.cameras):
             own = problem.camera == index
-            of_lenses += (
-                LensErrors(problem.corners[own], camera, errors).covariance(gains[own].reshape(-1, 1, 2)).item()
-            )
+            lens = LensErrors(problem.corners[own], camera, errors)
+            of_lenses += lens.covariance(gains[own].reshape(-1, 1, 2)).item()
         noise = widened * self._noise_of_common[0, 0]
         return float(self.system.covariance[0, 0] ** 2 * (of_shapes + of_lenses) + noise)
 

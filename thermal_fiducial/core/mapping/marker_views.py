@@ -184,7 +184,7 @@ class MarkerViews:
         The errors are the corners', whose covariance counts ``noise`` times, and those of the cameras' poses.
         """
         own = np.arange(len(fits.chosen)), fits.chosen
-        _, J_camera, J_marker = (J[0] for J in self._linearised(fits.T[:1], self._T_map_camera[own][None]))
+        _, J_camera, J_marker = self._at_best(fits)
         J_camera, J_marker = fits.W @ J_camera, fits.W @ J_marker
         white = np.linalg.inv(np.einsum('vri,vrj->ij', J_marker, J_marker))
         gains = -white @ np.einsum('vri,vrj->vij', J_marker, J_camera)
@@ -205,8 +205,7 @@ class MarkerViews:
         variance has the noise of the residuals that this leaves. As well as it is declared a side need not be right:
         that of this marker, and those of the markers that the cameras are known by.
         """
-        own = np.arange(len(fits.chosen)), fits.chosen
-        r, _, J_marker = (of_best[0] for of_best in self._linearised(fits.T[:1], self._T_map_camera[own][None]))
+        r, _, J_marker = self._at_best(fits)
         from_centre = marker_corners(self._size) @ fits.T[0, :3, :3].T
         by_side = np.einsum('vcij,cj->vci', J_marker[..., :3].reshape(-1, 4, 2, 3), from_centre).reshape(-1, 8)
         white = (fits.W @ np.concatenate([J_marker, by_side[..., None], r[..., None]], axis=-1)).reshape(-1, 8)
@@ -227,6 +226,12 @@ class MarkerViews:
             return first
         costs = [self._weights(T, choice).costs for choice in (first, first + 1)]
         return np.asarray(np.argmin(np.where(np.isfinite(costs), costs, np.inf), axis=0))
+
+    def _at_best(self, fits: FittedPoses) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of the best fit: residuals (n, 8) [px], and derivatives (n, 8, 6) by the cameras and by the marker."""
+        T_map_camera = self._T_map_camera[np.arange(len(fits.chosen)), fits.chosen]
+        r, J_camera, J_marker = self._linearised(fits.T[:1], T_map_camera[None])
+        return r[0], J_camera[0], J_marker[0]
 
     def _linearised(self, T: FloatArray, T_map_camera: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Residuals (S, n, 8) [px] of markers at T, and derivatives (S, n, 8, 6) by the cameras and by the marker."""

@@ -66,7 +66,7 @@ class NormalEquations:
             root = np.linalg.inv(np.linalg.cholesky(_damped(blocks.frame, damping)))
             cross = root[self._frame] @ blocks.cross[self._order]
             coupling, node = self._coupling(cross), _damped(blocks.node, damping)
-            dense = node.size <= 6 * _DENSE
+            dense = 6 * len(node) <= _DENSE
             matrix = coupling.schur(node) if dense else self._sparse_schur(cross, node)
             free = np.flatnonzero(np.repeat(~self._held, 6))
             own = matrix[free][:, free]
