@@ -50,7 +50,7 @@ MECHANISMS = {
     'map of the present markers': Mechanism(
         ('map in the making',),
         (
-            'pose_noise:BodyPose.map_change',
+            'pose_noise:BodyPose.map_changes',
             'pose_noise:BodyPose.moved_by',
             'update:_with_markers',
             'update:_in_map_of_markers',

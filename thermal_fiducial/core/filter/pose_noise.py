@@ -17,8 +17,7 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import covariance_root
 from thermal_fiducial.core.geometry.plausibility import LEAST_INDEPENDENT
-from thermal_fiducial.core.geometry.reprojection import lever_arm
-from thermal_fiducial.core.geometry.se3 import rotation_angle
+from thermal_fiducial.core.geometry.se3 import rotation_angle, skew
 from thermal_fiducial.core.measurements import NOTHING_KNOWN
 from thermal_fiducial.core.types import FloatArray
 
@@ -35,23 +34,21 @@ _MEMORY = np.array((10.0, 300.0, 300.0))
 _PRIOR, _LARGEST_SQUARE = 5.0, 9.0
 #: A pose that claims less of a turn [rad] says nothing of it: a third of what the mapper claims then.
 _UNKNOWN_TURN = NOTHING_KNOWN / 3.0
+ORIGIN = np.zeros(3)
 #: Least covariance of a pose: rounding of float32 corners [rad, m].
 _ROUNDING = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
 
 
-def displacement_of_body(T_map_body: FloatArray, arm: FloatArray) -> FloatArray:
+def displacement_of_body(T_map_body: FloatArray, about: FloatArray = ORIGIN) -> FloatArray:
     """Map (6, 6) from a displacement in the map, position first, to that of the robot in its frame, rotation first.
 
-    ``arm`` (3,): from the displaced point to the robot, in the map [m].
+    ``about`` (3,): the displaced point in the map [m]; a motion of the map is one about its origin.
     """
-    turn = np.zeros((6, 6))
-    turn[:3, 3:] = turn[3:, :3] = T_map_body[:3, :3].T
-    return turn @ lever_arm(arm)
-
-
-def displacement_by_map(T_map_body: FloatArray) -> FloatArray:
-    """As :func:`displacement_of_body`, from a motion of the map about its origin."""
-    return displacement_of_body(T_map_body, T_map_body[:3, 3])
+    R_body_map = T_map_body[:3, :3].T
+    J = np.zeros((6, 6))
+    J[:3, 3:] = J[3:, :3] = R_body_map
+    J[3:, 3:] = -R_body_map @ skew(T_map_body[:3, 3] - about)
+    return J
 
 
 @dataclass(frozen=True)
@@ -72,7 +69,7 @@ class BodyPose:
     @cached_property
     def by_map(self) -> FloatArray:
         """(6, 6) its derivative by a motion of the map about its origin, in the conventions of ``covariance``."""
-        return displacement_by_map(self.T_map_body)
+        return displacement_of_body(self.T_map_body)
 
     def after(self, last: 'BodyPose', T_map_body: FloatArray) -> 'BodyPose':
         """It as the ``last`` pose of the next one, seen from ``T_map_body`` of the estimate.
@@ -109,36 +106,23 @@ class BodyPose:
         moved = float(np.linalg.norm(T[:3, 3] - T_last[:3, 3])) / distance
         return math.exp(-(turned + moved) / angle + log_overlap(last.shape, self.shape))
 
-    def map_change(self, other: FloatArray) -> FloatArray:
-        """Covariance (6, 6) of the motion from a map's error of covariance ``other`` to that of this pose.
+    def map_changes(self, others: FloatArray) -> FloatArray:
+        """Covariances (n, 6, 6) of the motions from the map errors of covariances ``others`` (n, 6, 6) to that of it.
 
         The least motion that makes one of the other (optimal transport of Gaussians; I. Olkin, F. Pukelsheim, "The
         distance between two random vectors with given dispersion matrices", 1982): the same markers have the same
         error, and those that were placed by them about the same. In units of what the pose claims beside it; by the
         white part of that, covariances that the mapper evaluates at a noisy pose differ without a change.
         """
-        now, then = self._map_root, self._in_units(other)
-        U, _, Vt = np.linalg.svd(then.T @ now)
-        change = self._map_units @ (now @ Vt.T - then @ U)
-        return np.asarray(change @ change.T)
-
-    @cached_property
-    def _map_units(self) -> FloatArray:
-        """(6, 6) motions of the map that move the pose by a standard deviation of what it claims beside the map."""
-        return np.linalg.solve(self.by_map, np.linalg.cholesky(self.shape))
-
-    @cached_property
-    def _to_map_units(self) -> FloatArray:
-        return np.asarray(np.linalg.inv(self._map_units))
-
-    @cached_property
-    def _map_root(self) -> FloatArray:
-        return self._in_units(self.map_covariance)
-
-    def _in_units(self, of_map: FloatArray) -> FloatArray:
-        """Root (6, 6) of the covariance ``of_map`` and of white noise, in the units of ``_map_units``."""
-        to_units = self._to_map_units
-        return covariance_root(to_units @ of_map @ to_units.T + WHITE * np.eye(6))
+        # Motions of the map that move the pose by a standard deviation of what it claims beside the map.
+        units = np.linalg.solve(self.by_map, np.linalg.cholesky(self.shape))
+        to_units = np.linalg.inv(units)
+        of_maps = np.concatenate((self.map_covariance[None], others))
+        roots = covariance_root(to_units @ of_maps @ to_units.T + WHITE * np.eye(6))
+        now, then = roots[0], roots[1:]
+        U, _, Vt = np.linalg.svd(then.swapaxes(1, 2) @ now)
+        changes = units @ (now @ Vt.swapaxes(1, 2) - then @ U)
+        return np.asarray(changes @ changes.swapaxes(1, 2))
 
     def moved_by(self, of_map: FloatArray) -> float:
         """Sum of the variances of the robot's position by a motion of the map of covariance ``of_map`` (6, 6)."""

@@ -11,7 +11,6 @@ from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
 from thermal_fiducial.core.filter.pose_noise import (
     BodyPose,
-    displacement_by_map,
     displacement_of_body,
     PoseNoise,
     share_that_stays,
@@ -78,7 +77,7 @@ class Innovation(NamedTuple):
 def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> BodyPose:
     """Pose of the robot by a camera pose whose standard deviations are multiplied by ``scale``."""
     T_map_body = pose.T_map_camera @ inverse(T_body_camera)
-    J = displacement_of_body(T_map_body, T_map_body[:3, 3] - pose.T_map_camera[:3, 3])
+    J = displacement_of_body(T_map_body, about=pose.T_map_camera[:3, 3])
     relative = scale**2 * (J @ (pose.covariance - pose.map_covariance) @ J.T)
     to_origin = lever_arm(-pose.T_map_camera[:3, 3])
     return BodyPose(T_map_body, relative, to_origin @ pose.map_covariance @ to_origin.T)
@@ -98,7 +97,7 @@ def _unexplained(state: NavigationState, pose: BodyPose) -> FloatArray:
 
 def _by_map(state: NavigationState) -> FloatArray:
     """(6, 6) derivative of a measured pose by the motion of its markers' map."""
-    return displacement_by_map(state.T_map_markers @ state.T_map_body)
+    return displacement_of_body(state.T_map_markers @ state.T_map_body)
 
 
 def mount_jacobian(state: NavigationState) -> FloatArray:
@@ -117,7 +116,7 @@ def map_jacobian(state: NavigationState) -> FloatArray:
 
 def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, motion: MotionAtPose) -> Innovation:
     """Innovation of ``pose`` against ``estimate`` at the same instant."""
-    prior = _in_view(config, estimate, pose)
+    prior = _with_markers(_in_view(config, estimate, pose), pose)
     derivative = prior.state.derivative(motion.imu)
     H = np.zeros((6, SIZE))
     H[_SIX, POSE] = 1.0
@@ -158,7 +157,8 @@ def with_covariance(config: PoseEkfConfig, innovation: Innovation, covariance: F
 def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
     """The estimate after an accepted pose."""
     prior, before = innovation.prior, innovation.derivative
-    error, covariance = _gained(innovation)
+    gain, covariance = _gained(innovation)
+    error = _iterated(innovation, gain)
     state = prior.state.plus(error)
     if config.estimate_time_offset:
         now = state.derivative(innovation.motion.imu)
@@ -200,7 +200,7 @@ def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estim
     P[:, SYSTEMATIC] = P[:, SYSTEMATIC] @ kept.T
     P[SYSTEMATIC, SYSTEMATIC] += of_view - alike**2 * stays @ of_view
     state = replace(estimate.state, systematic=kept @ estimate.state.systematic)
-    return _with_markers(replace(estimate, state=state, covariance=P), pose)
+    return replace(estimate, state=state, covariance=P)
 
 
 def _with_markers(estimate: Estimate, pose: BodyPose) -> Estimate:
@@ -213,9 +213,10 @@ def _with_markers(estimate: Estimate, pose: BodyPose) -> Estimate:
     now = pose.after(noise.last, estimate.state.T_map_body)
     if not any(C.any() for C in (now.map_covariance, noise.of_map, P[MARKERS, MARKERS])):
         return estimate
-    P[MARKERS, MARKERS] += now.map_change(noise.last.map_covariance)
+    since_last, apart = now.map_changes(np.stack((noise.last.map_covariance, noise.of_map)))
+    P[MARKERS, MARKERS] += since_last
     estimate = replace(estimate, covariance=P)
-    apart, is_worse = now.map_change(noise.of_map), now.moved_by(now.map_covariance) > now.moved_by(noise.of_map)
+    is_worse = now.moved_by(now.map_covariance) > now.moved_by(noise.of_map)
     if is_worse and now.moved_by(apart) > P[POSITION, POSITION].trace():
         return estimate
     if now.moved_by(P[MARKERS, MARKERS]) > now.moved_by(apart):
@@ -230,7 +231,7 @@ def _in_map_of_markers(estimate: Estimate) -> Estimate:
     """The estimate in the map as the present markers have it."""
     state = estimate.state.in_moved_map(estimate.state.T_map_markers)
     moved = np.eye(SIZE)
-    moved[:, MARKERS] = map_jacobian(state) @ displacement_by_map(state.T_map_body)
+    moved[:, MARKERS] = map_jacobian(state) @ displacement_of_body(state.T_map_body)
     moved[MARKERS] = 0.0
     covariance = moved @ estimate.covariance @ moved.T
     return replace(estimate, state=replace(state, T_map_markers=np.eye(4)), covariance=covariance)
@@ -280,7 +281,7 @@ def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, inno
 
 
 def _gained(innovation: Innovation) -> tuple[FloatArray, FloatArray]:
-    """Kalman update: the corrected error (54,) and the covariance (54, 54).
+    """Kalman update: the gain (54, 6) and the covariance (54, 54).
 
     The gain is that of exact extrinsics, so the estimate does not depend on how well they are said to be known; the
     covariance has all that their errors do to it.
@@ -293,7 +294,7 @@ def _gained(innovation: Innovation) -> tuple[FloatArray, FloatArray]:
     algebra.update(innovation.value, lambda _: innovation.H, lambda _: np.zeros(6), R=innovation.R)
     of_extrinsics = of_extrinsics - algebra.K @ (innovation.H @ of_extrinsics)
     covariance = 0.5 * (algebra.P + algebra.P.T) + of_extrinsics @ of_extrinsics.T
-    return _iterated(innovation, algebra.K), covariance
+    return algebra.K, covariance
 
 
 def _iterated(innovation: Innovation, gain: FloatArray) -> FloatArray:

@@ -304,12 +304,13 @@ def test_the_map_has_the_same_error_while_its_covariance_is_the_same():
     # The robot turns, the map's error doesn't.
     for turn in (turned, turned @ so3_exp([0.0, 0.8, 0.0])):
         here = BodyPose(transform(turn, [3.0, -1.0, 0.5]), 1e-12 * np.eye(6), of_map)
+        from_same, from_none, from_half = here.map_changes(np.stack((of_map, 0.0 * of_map, 0.25 * of_map)))
         # rounding, squared
-        np.testing.assert_allclose(here.map_change(of_map), 0.0, atol=1e-15)
+        np.testing.assert_allclose(from_same, 0.0, atol=1e-15)
         # All of it is another one than none, half of it than one of half as much; to the least noise of a pose: 0.1 mm
         # beside 20 mm.
-        np.testing.assert_allclose(here.map_change(np.zeros((6, 6))), of_map, rtol=1e-2, atol=1e-6)
-        np.testing.assert_allclose(here.map_change(0.25 * of_map), 0.25 * of_map, rtol=1e-2, atol=1e-6)
+        np.testing.assert_allclose(from_none, of_map, rtol=1e-2, atol=1e-6)
+        np.testing.assert_allclose(from_half, 0.25 * of_map, rtol=1e-2, atol=1e-6)
 
 
 def test_what_the_noise_of_a_pose_makes_of_the_covariance_of_the_map_is_no_change():
@@ -317,7 +318,7 @@ def test_what_the_noise_of_a_pose_makes_of_the_covariance_of_the_map_is_no_chang
     vague = np.diag([1e-6, 1e-6, 1e-6, 0.09, 1e-6, 1e-6])
     of_map = np.diag([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
     # Squares of 0.13 m and of 1 cm beside it differ by a thirtieth of 1 cm.
-    assert BodyPose(np.eye(4), vague, of_map).map_change(np.zeros((6, 6)))[0, 0] < 2e-7
+    assert BodyPose(np.eye(4), vague, of_map).map_changes(np.zeros((1, 6, 6)))[0, 0, 0] < 2e-7
 
 
 def test_an_error_of_the_map_along_an_axis_that_turns_changes_as_the_axis_does():
@@ -325,7 +326,7 @@ def test_an_error_of_the_map_along_an_axis_that_turns_changes_as_the_axis_does()
     axes = np.zeros((2, 6))
     axes[:, :2] = (1.0, 0.0), (math.cos(0.1), math.sin(0.1))
     then, now = (1e-2 * np.outer(axis, axis) for axis in axes)
-    change = BodyPose(np.eye(4), 1e-12 * np.eye(6), now).map_change(then)
+    (change,) = BodyPose(np.eye(4), 1e-12 * np.eye(6), now).map_changes(then[None])
     apart = 1e-1 * (axes[1] - axes[0])
     # to the least noise of a pose, 0.03 mm, beside 10 mm
     np.testing.assert_allclose(change, np.outer(apart, apart), atol=1e-6)
