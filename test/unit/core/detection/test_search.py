@@ -7,7 +7,7 @@ import pytest
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.camera_frames import pixel_noise
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.finding.search import BlindSearch, inside_out, SearchScales
+from thermal_fiducial.core.detection.finding.search import BlindSearch, overlapped, SearchScales
 from thermal_fiducial.core.detection.patterns import Decoder, Dictionary, Reading, sampled, shrunk
 from thermal_fiducial.core.detection.prediction.frame import Frame, Places
 from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
@@ -180,25 +180,27 @@ def test_bright_markers_far_away_are_found(contrast, side, half_cells):
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_edge_of_a_plate_is_no_markerinside_out(sign):
-    """Readings at one place: a marker without much of a surround, the edge of its plate, bits in it, another."""
-    correlation = sign * np.array([0.96, -0.89, -0.88, -0.9])
+def test_one_marker_at_a_place(sign):
+    """A marker without much of a surround, the edge of its plate, bits in it, an inaccurate outline, another marker."""
+    correlation = sign * np.array([0.96, -0.89, -0.88, 0.79, -0.9])
     reading = Reading(
-        np.array([19, 10, 17, 4]),
-        np.zeros(4, dtype=np.int64),
+        np.array([19, 10, 17, 32, 4]),
+        np.zeros(5, dtype=np.int64),
         correlation,
-        np.full(4, 0.6),
+        np.full(5, 0.6),
         100.0 * correlation,
-        np.zeros(4, dtype=np.int64),
-        np.array([0.5, 1.2, 0.9, 1.0]),
+        np.zeros(5, dtype=np.int64),
+        np.array([0.5, 1.2, 0.9, 0.6, 1.0]),
     )
-    factor = np.array([1.0, 1.5, 0.6, 1.0])[:, None, None]
+    factor = np.array([1.0, 1.5, 0.6, 1.1, 1.0])[:, None, None]
     quads = CORNERS.mean(axis=0) + factor * (CORNERS - CORNERS.mean(axis=0))
-    quads[3] += 200.0
-    everything = np.ones(4, dtype=bool)
-    assert inside_out(reading, quads, everything, everything).tolist() == [False, True, True, False]
-    # What cannot be read is no evidence against another.
-    assert not inside_out(reading, quads, everything, ~everything).any()
+    quads[4] += 200.0
+    everything = np.ones(5, dtype=bool)
+    assert overlapped(reading, quads, everything, everything).tolist() == [False, True, True, True, False]
+    # A marker that is only readable keeps the edge of its plate out, what cannot be read is no evidence.
+    edge_and_other = np.array([False, True, False, False, True])
+    assert overlapped(reading, quads, edge_and_other, everything).tolist() == [False, True, False, False, False]
+    assert not overlapped(reading, quads, edge_and_other, edge_and_other).any()
 
 
 def test_what_is_seen_already_is_not_searched_for():

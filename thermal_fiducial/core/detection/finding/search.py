@@ -113,7 +113,7 @@ class BlindSearch:
         good &= (frame.camera.contains(quads, CUT_OFF_PX) & frame.camera.shows(quads)).all(axis=1)
         if not good.any():
             return Outlines.none()
-        good &= ~inside_out(reading, quads, good, distinct(reading, frame.noise, config))
+        good &= ~overlapped(reading, quads, good, distinct(reading, frame.noise, config))
         return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), frame.noise)
 
     def _fine_mask(self, frame: Frame, *, clear: bool) -> Gray:
@@ -198,19 +198,21 @@ def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDete
     return np.asarray(distinct(reading, noise, config) & right)
 
 
-def inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: BoolArray) -> BoolArray:
-    """Which good readings (Q,) overlap a more similar ``readable`` one of opposite polarity: a plate, or inner bits.
+def overlapped(reading: Reading, quads: FloatArray, good: BoolArray, readable: BoolArray) -> BoolArray:
+    """Which good readings (Q,) are at the place of a more similar one, which is the marker there.
 
-    They must not take the place of the marker itself.
+    That is one of opposite polarity, good or only ``readable``, of which they are the plate or inner bits, or a good
+    one of another ID, of which they are an inaccurate outline.
     """
-    mine, others = np.flatnonzero(good), np.flatnonzero(readable)
+    mine, others = np.flatnonzero(good), np.flatnonzero(readable | good)
     similarity, centre = np.abs(reading.correlation), quads.mean(axis=1)
     across = diagonals(quads)
     apart = np.linalg.norm(centre[mine, None] - centre[others], axis=-1)
     together = apart < TOGETHER * np.maximum(across[mine, None], across[others])
     opposite = reading.correlation[mine, None] * reading.correlation[others] < 0.0
+    different = (reading.ids[mine, None] != reading.ids[others]) & good[others]
     result = np.zeros(len(good), dtype=bool)
-    result[mine] = (together & opposite & (similarity[others] > similarity[mine, None])).any(axis=1)
+    result[mine] = (together & (opposite | different) & (similarity[others] > similarity[mine, None])).any(axis=1)
     return result
 
 
