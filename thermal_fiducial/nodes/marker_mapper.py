@@ -53,7 +53,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             self._map.note_learned()
         changed = self._result.map_changed
         try:
-            changed |= self._map.refinement.step(frame.stamp_ns)
+            changed |= self._map.refine_in_flight(frame.stamp_ns)
         finally:  # A refinement that has failed keeps no change of this frame back.
             if changed:
                 self._publish_map()

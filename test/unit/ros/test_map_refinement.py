@@ -1,5 +1,6 @@
 """The last refinement of a flight: with its last keyframes, before the map is saved, and never waited for in vain."""
 
+import itertools
 import multiprocessing
 import os
 import signal
@@ -7,15 +8,18 @@ import time
 
 import numpy as np
 import pytest
+from std_srvs.srv import Trigger
 from support.messages import info
 from support.walls import CAMERA, flight, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.measurements import MARKER_DTYPE
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
+from thermal_fiducial.ros.mapper_node import map_services
 from thermal_fiducial.ros.mapper_node.map_refinement import MapRefinement
 from thermal_fiducial.ros.messages import clouds, convert
 
@@ -24,6 +28,8 @@ NOISE_PX = 0.2
 FRAMES = range(0, 120, 3)
 #: Error of the refined map over that of the map in flight: twice what it is.
 BETTER = 0.5
+#: A frame without a marker.
+NOTHING = np.zeros(0, MARKER_DTYPE)
 
 
 def rows_of_flight(poses):
@@ -97,22 +103,66 @@ def test_a_process_that_does_not_answer_is_not_waited_for(poses):
         refinement.close()
 
 
-@pytest.mark.ros
-def test_the_map_is_saved_as_the_last_refinement_has_it(graph, tmp_path, poses):
-    path = tmp_path / 'hall.yaml'
+def flown_node(graph, path, poses, **parameters):
+    """A mapper's node after the flight."""
     save_map(path, first_map(poses))
-    # None in flight.
-    node = graph.add(MarkerMapperNode, map_file=str(path), refinement_period=1000.0)
-    (frames,) = (source for source in node.inputs if source.topic == '/markers')
+    node = graph.add(MarkerMapperNode, map_file=str(path), **parameters)
     graph.send('thermal/camera_info', info(CAMERA))
-    for sent, (k, rows) in enumerate(zip(FRAMES, rows_of_flight(poses), strict=True), start=1):
-        graph.send('markers', clouds.cloud(rows, convert.header(stamp(k), 'camera')))
-        # One by one: of several that wait a node takes the newest.
-        graph.spin_until(lambda sent=sent: frames.count == sent)
+    for k, rows in zip(FRAMES, rows_of_flight(poses), strict=True):
+        show(graph, node, k, rows)
+    return node
+
+
+def show(graph, node, k, rows):
+    """Send a frame, and wait for it: of several that wait a node takes the newest."""
+    (frames,) = (source for source in node.inputs if source.topic == '/markers')
+    count = frames.count
+    graph.send('markers', clouds.cloud(rows, convert.header(stamp(k), 'camera')))
+    graph.spin_until(lambda: frames.count > count)
+
+
+def ask(graph, service):
+    return graph.call(Trigger, f'marker_mapper/{service}', Trigger.Request()).success
+
+
+def is_saved_refined(node, path, poses, before):
+    """Whether the file is as the node has the map, and that is better than with ``before`` [mm]."""
+    saved = load_map(path)
+    assert saved.markers.keys() == poses.keys()
+    return saved.revision == node.mapper.map.revision and errors_mm(saved, poses) < BETTER * before
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('saved', [False, True])
+def test_the_map_is_saved_as_the_last_refinement_has_it(graph, tmp_path, poses, saved):
+    """Also where a service has saved it, and no marker was in view since: the robot has landed."""
+    path = tmp_path / 'hall.yaml'
+    # None in flight.
+    node = flown_node(graph, path, poses, refinement_period=1000.0)
     before = errors_mm(node.mapper.map, poses)
+    if saved:
+        assert ask(graph, 'save')
     node.finish()
     node.close()
-    saved = load_map(path)
-    assert saved.revision == node.mapper.map.revision
-    assert saved.markers.keys() == poses.keys()
-    assert errors_mm(saved, poses) < BETTER * before
+    assert is_saved_refined(node, path, poses, before)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('applied', [False, True])
+def test_a_refinement_that_came_after_a_save_is_saved_at_the_end(graph, tmp_path, poses, monkeypatch, applied):
+    """It is done or under way when the node is stopped; no marker is in view any more."""
+    # Longer than it takes even beside eight busy programs.
+    monkeypatch.setattr(map_services, '_LAST_REFINEMENT_S', 60.0)
+    path = tmp_path / 'hall.yaml'
+    node = flown_node(graph, path, poses, live=True, refinement_period=1000.0)
+    before, revision = errors_mm(node.mapper.map, poses), node.mapper.map.revision
+    landed = (FRAMES[-1] + k for k in itertools.count(1))
+    # The process takes a while to start.
+    while not ask(graph, 'refine'):
+        show(graph, node, next(landed), NOTHING)
+    assert ask(graph, 'save')
+    while applied and node.mapper.map.revision == revision:
+        show(graph, node, next(landed), NOTHING)
+    node.finish()
+    node.close()
+    assert is_saved_refined(node, path, poses, before)

@@ -111,6 +111,19 @@ class MapServices:
         """Mark the map as changed since the last save."""
         self._keeper.unsaved = True
 
+    def refine_in_flight(self, stamp_ns: int) -> bool:
+        """Go on with the refinement after each frame; returns whether one has changed the map.
+
+        Raises
+        ------
+        InputError
+            A refinement failed.
+        """
+        changed = self.refinement.step(stamp_ns)
+        if changed:
+            self.note_learned()
+        return changed
+
     def save(self) -> str:
         """Write the map file, or another one if it cannot be replaced; returns a message with path and reason."""
         marker_map = self._copy_to_save()
@@ -171,11 +184,13 @@ class MapServices:
 
         A copy is saved first: whoever starts the node may kill it for taking its time.
         """
-        if not (self._node.config.map_file and self._keeper.unsaved):
+        to_do = self._keeper.unsaved or self.mapper.has_unrefined or self.refinement.busy
+        if not (self._node.config.map_file and to_do):
             return
         self._keeper.autosave(self.mapper.map)
         try:
-            self.refinement.finish(_LAST_REFINEMENT_S)
+            if self.refinement.finish(_LAST_REFINEMENT_S):
+                self.note_learned()
         except InputError as error:
             self._node.get_logger().warning(f'the map is saved as it was in flight: {error}')
 
