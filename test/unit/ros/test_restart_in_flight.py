@@ -2,6 +2,7 @@
 
 import json
 import os
+import threading
 import time
 
 import pytest
@@ -11,6 +12,7 @@ from support.ros_graph import ros_graph
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.clock_offset import recent_clock_offset, save_clock_offset
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
+from thermal_fiducial.ros.filter_node import filter_memory
 
 
 def test_the_file_holds_it_for_ten_seconds(tmp_path):
@@ -87,6 +89,7 @@ def test_a_restarted_filter_begins_with_the_offset_of_the_one_before(tmp_path, m
         fly(graph, 0, 60)
         assert not node.filter.lost
         node.diagnose(0)
+        graph.spin_until(lambda: list(tmp_path.rglob('*.json')))
         # It is killed, or it has crashed or is deaf and closes what it has: in any case the flight goes on.
         if closed:
             node.close()
@@ -102,3 +105,42 @@ def test_a_restarted_filter_begins_with_the_offset_of_the_one_before(tmp_path, m
     with ros_graph() as graph:
         graph.add(PoseEkfNode, live=True)
     assert 'started again' not in capfd.readouterr().err
+
+
+@pytest.mark.ros
+def test_a_slow_disk_holds_no_pose(monkeypatch):
+    """Where bags are recorded on the same disk, each of these files took up to 51 ms, once a second."""
+    idle, written = threading.Event(), []
+
+    def save(path, offset):
+        assert idle.wait(60.0)
+        written.append(offset)
+
+    monkeypatch.setattr(filter_memory, 'save_clock_offset', save)
+    with ros_graph() as graph:
+        node = graph.add(PoseEkfNode, live=True, camera_time_offset=0.007, time_offset_std=0.001)
+        fly(graph, 0, 60)
+        poses = graph.published(node, 'pose')
+        # The second one does not wait for the first.
+        for k in (60, 61):
+            node.diagnose(0)
+            graph.send('imu/data', imu(k))
+        assert graph.published(node, 'pose') == poses + 2
+        assert not written
+        idle.set()
+        node.finish()
+        assert written == [pytest.approx(0.007, abs=1e-4)]
+
+
+@pytest.mark.ros
+def test_a_place_that_cannot_be_written_is_reported_once(monkeypatch, tmp_path):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    (tmp_path / 'thermal_fiducial').touch()
+    with ros_graph() as graph:
+        node = graph.add(PoseEkfNode, live=True, time_offset_std=0.001)
+        fly(graph, 0, 60)
+        graph.spin_until(lambda: node.last_refusal or node.guard(lambda _: node.diagnose(0), None))
+        assert (node.refused, 'thermal_fiducial' in node.last_refusal) == (1, True)
+        for _ in range(3):
+            node.diagnose(0)
+        assert node.refused == 1
