@@ -15,6 +15,7 @@ from support.tasks import write_twice
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files import work_folders
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.marker_map import load_map
@@ -274,7 +275,7 @@ def killed_at(step, monkeypatch):
         happens()
 
     monkeypatch.setattr(Path, 'rename', rename)
-    monkeypatch.setattr(many_bags.shutil, 'rmtree', half_removed)
+    monkeypatch.setattr(work_folders.shutil, 'rmtree', half_removed)
 
 
 def written(options, progress, warn):
@@ -317,6 +318,21 @@ def test_a_worker_that_is_killed_while_it_replaces_a_run_leaves_one_whole(tmp_pa
     with many_bags.Batch((options.bag,), run.parent, options).cleared_up():
         pass
     assert list(contents(tmp_path)) == [Path('out/flight') / left]
+
+
+def test_clearing_up_after_a_run_takes_nothing_of_another(tmp_path):
+    """A second run whose name begins like the first one's, killed between two renames, and what is somebody else's."""
+    out = tmp_path / 'out'
+    for kept in ('.flight-2-abcdefgh/flight-2.earlier', '.flight-notes/mine', '.flight-abcdefgh/mine'):
+        (out / kept).mkdir(parents=True)
+        (out / kept / 'old').touch()
+    (out / '.flight-ijklmnop' / 'flight').mkdir(parents=True)
+    bags = tuple(map(Path, ('flight', 'flight-2')))
+    with many_bags.Batch(bags, out, many_bags.Options(bag=bags[0], run=out)).cleared_up():
+        pass
+    kept = ('flight-2/old', '.flight-notes/mine/old', '.flight-abcdefgh/mine/old')
+    assert sorted(contents(out)) == sorted(map(Path, kept))
+    assert not (out / '.flight-ijklmnop').exists()
 
 
 @pytest.mark.nightly

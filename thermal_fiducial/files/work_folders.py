@@ -1,6 +1,6 @@
 """Hidden folders for what appears under its own name once it is whole."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 import fcntl
 import os
@@ -57,10 +57,7 @@ def work_folder(out: Path) -> Iterator[Path]:
     """
     # Under the lock of their common folder none is taken for left behind before it has its own lock.
     with locked(out):
-        for folder in _named_as_those_of(out):
-            # It may be somebody else's.
-            with suppress(OSError):
-                _remove_if_left(folder, out.name)
+        remove_left_behind(out, {out.name})
         folder = Path(tempfile.mkdtemp(prefix=f'.{out.name}-', dir=out.parent))
         descriptor = os.open(folder, os.O_RDONLY)
         _lock(descriptor)
@@ -71,16 +68,23 @@ def work_folder(out: Path) -> Iterator[Path]:
         shutil.rmtree(folder)
 
 
-def _named_as_those_of(out: Path) -> list[Path]:
+def named_as_those_of(out: Path) -> list[Path]:
+    """Folders beside ``out`` with names as work folders of it have; they may be somebody else's."""
     name = re.compile(rf'\.{re.escape(out.name)}-[a-z0-9_]{{8}}')
     return [path for path in out.parent.iterdir() if name.fullmatch(path.name)]
 
 
-def _remove_if_left(folder: Path, name: str) -> None:
-    """Remove a folder that holds nothing but what ``name`` would become, unless a process has locked it."""
+def remove_left_behind(out: Path, names: Collection[str]) -> None:
+    """Remove work folders of ``out`` that hold nothing but ``names``, unless a process has locked them."""
+    for folder in named_as_those_of(out):
+        with suppress(OSError):
+            _remove_if_left(folder, names)
+
+
+def _remove_if_left(folder: Path, names: Collection[str]) -> None:
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
-        if {item.name for item in folder.iterdir()} <= {name} and _lock(descriptor):
+        if {item.name for item in folder.iterdir()} <= set(names) and _lock(descriptor):
             shutil.rmtree(folder)
     finally:
         os.close(descriptor)

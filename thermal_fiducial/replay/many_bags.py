@@ -9,7 +9,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 import json
 from pathlib import Path
-import shutil
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from thermal_fiducial.errors import InputError, RunError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.marker_map import load_map, save_map
-from thermal_fiducial.files.work_folders import work_folder
+from thermal_fiducial.files.work_folders import named_as_those_of, remove_left_behind, work_folder
 from thermal_fiducial.files.writing import into, write_text
 from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.replay.earlier_runs import refuse_other_folder
@@ -90,14 +89,15 @@ class Batch:
 
     @contextmanager
     def cleared_up(self) -> Iterator[None]:
-        """Remove at the end what workers that died or were interrupted have left; all workers must have ended."""
+        """Remove at the end what workers that died or were interrupted have left."""
         try:
             yield
         finally:
-            for run in self.runs():
-                for unfinished in run.run.parent.glob(f'.{run.run.name}-*'):
-                    _put_back(unfinished, run.run)
-                    shutil.rmtree(unfinished, ignore_errors=True)
+            runs = [options.run for options in self.runs()] if self.out.is_dir() else []
+            for run in runs:
+                for unfinished in named_as_those_of(run):
+                    _put_back(unfinished, run)
+                remove_left_behind(run, {run.name, _moved_aside(run, run.parent).name})
             # Empty if no bag was replayed.
             with suppress(OSError):
                 self.out.rmdir()
