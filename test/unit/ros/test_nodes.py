@@ -253,6 +253,21 @@ def test_a_calibration_of_another_resolution_is_doubted(graph):
     assert 'principal point (160, 128) in images of 640x512 pixels: is the calibration of another resolution?' in words
 
 
+def test_a_doubt_of_a_calibration_ends_with_it(graph, capfd):
+    """Two drivers of one camera, of which one has the calibration of another resolution, and then has it no more."""
+    node = graph.add(ArucoDetector, marker_size=small_bag.SIZE)
+    doubtful = replace(small_bag.CAMERA, K=small_bag.CAMERA.K * [[0.5], [0.5], [1.0]])
+    for _ in range(5):
+        graph.send('thermal/camera_info', info(doubtful), info())
+        assert 'another resolution' not in graph.diagnose(node)[1]
+    graph.send('thermal/camera_info', info(doubtful), info(), info(doubtful))
+    graph.send('thermal/image', frames(1)[0])
+    level, words, figures = graph.diagnose(node)
+    assert (level, words.count('another resolution'), figures['calibrations']) == (WARN, 1, '13')
+    # Once a second at most: they come with each frame.
+    assert capfd.readouterr().err.count('camera_info has changed') == 6
+
+
 def test_parameters_that_do_nothing_are_warned_of_while_the_detector_works(graph):
     node = graph.add(ArucoDetector, whitelist=[3, 77])
     dynamic = [Parameter('guided', value=False), Parameter('guided_min_margin', value=0.1)]

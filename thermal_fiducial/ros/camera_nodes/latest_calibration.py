@@ -25,6 +25,8 @@ class LatestCalibration:
         self._what = f'camera_info of {name}' if name else 'camera_info'
         self._camera: Camera | None = None
         self._message = b''
+        #: of the calibration, among the remarks of the node; empty without one
+        self._doubt = ''
         #: number of different calibrations received
         self.count = 0
 
@@ -49,7 +51,13 @@ class LatestCalibration:
         if self._camera is not None and camera.matches(self._camera):
             return
         self._camera = camera
-        self._node.remark(filter(None, [doubt_of_resolution(camera)]))
         self.count += 1
-        if self.count > 1:
-            self._node.get_logger().warning(f'{self._what} has changed: the new calibration is used from here on')
+        if self._doubt:
+            self._node.remarks.remove(self._doubt)
+        self._doubt = doubt_of_resolution(camera)
+        if self._doubt:
+            self._node.remarks.append(self._doubt)
+        changed = f'{self._what} has changed: the new calibration is used from here on' if self.count > 1 else ''
+        if news := '; '.join(filter(None, [changed, self._doubt])):
+            # Two drivers of one camera change it with each frame.
+            self._node.console.event(self._what, news)
