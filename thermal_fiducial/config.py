@@ -41,7 +41,7 @@ def param(
     length: int | None = None,
     normed: bool = False,
     verify: Callable[[Any], object] | None = None,
-    path: bool = False,
+    form: Callable[[str], str] | None = None,
     dynamic: bool = False,
     needs: tuple[str, ...] = (),
 ) -> Any:
@@ -58,7 +58,7 @@ def param(
     length : number of elements of a tuple of floats
     normed : whether the tuple must have unit norm (a quaternion)
     verify : called with the value; raises InputError if it is unusable
-    path : whether the string may be a path, in which a leading ~ is the user's home: no shell replaces it there
+    form : makes the value of a string: :func:`from_home` of a path, :func:`frame_name` of the name of a frame
     dynamic : whether it may be set while the node runs; otherwise it is declared read-only
     needs : parameters of the same node without which this one has no effect
     """
@@ -74,7 +74,7 @@ def param(
         'length': length,
         'normed': normed,
         'verify': verify,
-        'path': path,
+        'form': form,
         'dynamic': dynamic,
         'needs': needs,
     }
@@ -158,8 +158,8 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
     """
     limits = item.metadata
     result = _typed(name, item, value)
-    if limits['path']:
-        result = from_home(result)
+    if limits['form']:
+        result = limits['form'](result)
     if limits['choices'] and result not in limits['choices']:
         raise InputError(f'parameter {name}: {_shown(result)} is not one of {", ".join(limits["choices"])}')
     low, high = limits['minimum'], limits['maximum']
@@ -178,8 +178,16 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
 
 
 def from_home(path: str) -> str:
-    """``path`` with the user's home for a leading ~; an unknown user's stays, and so does an empty path."""
+    """``path`` with the user's home for a leading ~, since no shell replaces it in a parameter file.
+
+    An unknown user's stays, and so does an empty path.
+    """
     return os.path.expanduser(path)  # noqa: PTH111 - pathlib makes '.' of '' and fails for an unknown user
+
+
+def frame_name(name: str) -> str:
+    """``name`` without the slash that names of frames begin with in ROS 1; tf2 refuses it in messages."""
+    return name.lstrip('/')
 
 
 def _shown(value: object) -> str:
@@ -293,7 +301,9 @@ def _camera_orientation(frame: str = 'thermal_camera_optical', needs: tuple[str,
 
 
 def _calibration_file(if_empty: str) -> Any:
-    return param('', f'Camera calibration (camera_info YAML), published with each image. Empty: {if_empty}.', path=True)
+    return param(
+        '', f'Camera calibration (camera_info YAML), published with each image. Empty: {if_empty}.', form=from_home
+    )
 
 
 @dataclass(frozen=True)
@@ -304,7 +314,7 @@ class MarkerParameters(SelfChecked):
         'DICT_4X4_50',
         'Dictionary of the markers: a name of OpenCV or of this package (STENCIL_4X4_100 is the default of '
         '"markers make"), or the path of a dictionary file.',
-        path=True,
+        form=from_home,
     )
     marker_size: float = param(0.30, 'Side of the black square of a marker.', unit='m', minimum=0.005, maximum=10.0)
     marker_size_overrides: tuple[str, ...] = param(
@@ -324,7 +334,7 @@ class ImageParameters(SelfChecked):
     """What is published with the images of a camera."""
 
     calibration_file: str = _calibration_file('that of the driver, thermal/camera_info')
-    frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
+    frame_id: str = param('thermal_camera_optical', 'Frame of the published images.', form=frame_name)
 
 
 @dataclass(frozen=True)
@@ -340,9 +350,11 @@ class MountParameters(SelfChecked):
         choices=('auto', 'parameters'),
     )
     base_frame: str = param(
-        'base_link', 'Frame of the robot; identical to the IMU frame unless TF or a URDF says otherwise.'
+        'base_link',
+        'Frame of the robot; identical to the IMU frame unless TF or a URDF says otherwise.',
+        form=frame_name,
     )
-    camera_frame: str = param('thermal_camera_optical', 'Optical frame of the camera in TF and URDF.')
+    camera_frame: str = param('thermal_camera_optical', 'Optical frame of the camera in TF and URDF.', form=frame_name)
 
 
 @dataclass(frozen=True)
@@ -421,7 +433,9 @@ class Tau2CameraConfig(ImageRateParameters, FrameParameters, ImageParameters):
         'raw: thermal/image_raw; compressed: thermal/image_raw/compressed, 16-bit PNG of image_transport.',
         choices=('raw', 'compressed'),
     )
-    bad_pixel_file: str = param('', 'List of dead pixels: a text file, "column row" a line. Empty: none.', path=True)
+    bad_pixel_file: str = param(
+        '', 'List of dead pixels: a text file, "column row" a line. Empty: none.', form=from_home
+    )
     find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.', dynamic=True)
     bits: int = param(
         14,
@@ -577,13 +591,13 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
 class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, MountErrorParameters, MarkerParameters):
     """The incremental marker map."""
 
-    map_file: str = param('', 'Marker map (YAML). Empty: no map.', path=True)
+    map_file: str = param('', 'Marker map (YAML). Empty: no map.', form=from_home)
     mode: str = param(
         'mapping',
         'mapping: new markers enter the map; localization: the map never changes.',
         choices=('mapping', 'localization'),
     )
-    map_frame: str = param('map', 'Frame of the map.')
+    map_frame: str = param('map', 'Frame of the map.', form=frame_name)
     second_camera: str = param(
         '',
         'Name of a second camera, whose poses are fused with those of the first or replace them: subscribes to '
@@ -596,11 +610,13 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
     )
     # Without a second camera it still concerns the filter, and may stand in the file of parameters of all nodes.
     time_offset_random_walk: float = _clock_random_walk(())
-    cloud_file: str = param('', 'Point cloud of the site (.ply or .pcd) to publish for RViz. Empty: none.', path=True)
+    cloud_file: str = param(
+        '', 'Point cloud of the site (.ply or .pcd) to publish for RViz. Empty: none.', form=from_home
+    )
     cloud_alignment_file: str = param(
         '',
         'Transform from the map to the frame of cloud_file, written by map align. Empty: the frames are the same.',
-        path=True,
+        form=from_home,
         needs=('cloud_file',),
     )
     marker_size_std: float = param(
@@ -822,11 +838,12 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountE
         least=0.01,
         maximum=10000.0,
     )
-    map_frame: str = param('map', 'Frame of the pose.')
+    map_frame: str = param('map', 'Frame of the pose.', form=frame_name)
     odom_frame: str = param(
         '',
         'REP-105 odom frame: /tf gets odom_frame to base_frame (smooth output) and map_frame to odom_frame (the '
         'difference). Empty: map_frame to base_frame.',
+        form=frame_name,
         needs=('publish_tf', 'smoothing_time'),
     )
     resume: bool = param(
@@ -861,7 +878,7 @@ class ThermalSourceConfig(FrameParameters, ImageParameters):
         '',
         'Source of the frames: a V4L2 device (/dev/video0), a TeAx ThermalGrabber ("teax", or "teax:SERIAL" if there '
         'are several), or a folder, picture or video of 16 bits.',
-        path=True,
+        form=from_home,
     )
     image_width: int = param(0, 'Requested width; 0: as the camera is set.', unit='px', minimum=0, maximum=4096)
     image_height: int = param(0, 'Requested height; 0: as the camera is set.', unit='px', minimum=0, maximum=4096)
@@ -888,7 +905,7 @@ class LandingTargetConfig(FrameParameters, MountParameters):
         'body: relative to the robot (ArduPilot; mavros with mav_frame BODY_FRD); map: in the map (PX4; LOCAL_NED).',
         choices=('body', 'map'),
     )
-    map_frame: str = param('map', 'Frame of the map.')
+    map_frame: str = param('map', 'Frame of the map.', form=frame_name)
 
 
 #: Node to its parameters: the pipeline.

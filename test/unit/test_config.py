@@ -10,6 +10,7 @@ from thermal_fiducial import config
 from thermal_fiducial.config import (
     ArucoDetectorConfig,
     check_names,
+    from_home,
     from_mapping,
     group,
     ImuNoise,
@@ -255,6 +256,18 @@ def test_a_config_made_by_hand_checks_itself(make, words):
     assert words in str(error.value)
 
 
+def test_names_of_frames_begin_without_a_slash():
+    """Those of ROS 1 have one, which is no part of the name: tf2 refuses it in what the nodes publish."""
+    named = {
+        (kind, name): getattr(kind(**{name: '/there'}), name)
+        for kind in NODES
+        for name, _, _ in parameters(kind)
+        if name in ('base_frame', 'camera_frame', 'map_frame', 'odom_frame', 'frame_id')
+    }
+    assert len(named) == 14
+    assert set(named.values()) == {'there'}
+
+
 def test_a_path_may_begin_at_home(monkeypatch):
     monkeypatch.setenv('HOME', '/home/pilot')
     assert MarkerMapperConfig(map_file='~/hall.yaml').map_file == '/home/pilot/hall.yaml'
@@ -266,7 +279,7 @@ def test_a_path_may_begin_at_home(monkeypatch):
 
 def test_every_file_is_a_path():
     files = {name for kind in NODES for name, _, _ in parameters(kind) if name.endswith('_file')}
-    paths = {name for kind in NODES for name, item, _ in parameters(kind) if item.metadata['path']}
+    paths = {name for kind in NODES for name, item, _ in parameters(kind) if item.metadata['form'] is from_home}
     assert files
     assert paths == files | {'dictionary', 'camera'}
 

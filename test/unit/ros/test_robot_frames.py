@@ -107,6 +107,15 @@ def test_a_robot_description_decides_where_the_camera_is(graph, kind, capfd):
 
 
 @pytest.mark.ros
+def test_parameters_may_name_frames_as_ros_1_does(graph):
+    """They were frames that no robot has, so that the camera was taken to be where the parameters have it."""
+    node = graph.add(PoseEkfNode, base_frame='/base_link', camera_frame=f'/{CAMERA}')
+    graph.send('robot_description', String(data=URDF), profile=qos.LATCHED)
+    np.testing.assert_allclose(in_force(node), FORWARD, atol=1e-12)
+    assert (node.config.base_frame, node.config.camera_frame) == ('base_link', CAMERA)
+
+
+@pytest.mark.ros
 def test_parameters_hold_where_that_is_asked_for(graph, capfd):
     node = graph.add(PoseEkfNode, camera_position=[0.3, 0.0, 0.0], extrinsics='parameters')
     assert not [source for source in node.inputs if 'robot_description' in source.topic]
