@@ -326,6 +326,27 @@ def test_a_node_stops_silently(at_work, while_destroyed, while_python_ends, limi
     assert (done.returncode, said(done), done.stderr) == (status, ['finished', 'saved'], '')
 
 
+def test_what_fails_at_the_end_is_logged_and_the_rest_is_done_in_its_time():
+    """It went by without a word, and the time for leaving the graph began before the map was saved."""
+    program = """
+import os, signal, sys
+from support.empty_stage import EmptyStage
+from thermal_fiducial.ros.process import run
+
+class Stage(EmptyStage):
+    def __init__(self):
+        super().__init__()
+        self.completions += [lambda: 1 / 0, lambda: print('finished', flush=True)]
+        self.endings.append(lambda: print('saved, limit', signal.getitimer(signal.ITIMER_PROF)[0], flush=True))
+        self.create_timer(0.01, lambda: os.kill(os.getpid(), signal.SIGINT))
+
+sys.exit(run.run(Stage))
+"""
+    done = finished(program)
+    assert (done.returncode, said(done)) == (0, ['finished', 'saved, limit 0.0'])
+    assert 'ZeroDivisionError' in done.stderr
+
+
 @pytest.mark.parametrize('ending', [CRASHES, IS_DEAF])
 def test_a_node_that_crashes_or_is_deaf_and_does_not_end_is_no_stopped_one(ending):
     """It is to be started again: SIGPROF would say that it was asked to stop."""

@@ -206,9 +206,12 @@ class StageNode(CountingNode, Generic[Config]):
         return {}
 
     def finish(self) -> None:
-        """Run the ``completions``: what a flight that ends leaves to do."""
+        """Run the ``completions``: what a flight that ends leaves to do; one that fails is logged."""
         for complete in self.completions:
-            complete()
+            try:
+                complete()
+            except Exception as error:  # the map is still to be saved, in all the time that it takes
+                self._unforeseen(error)
 
     def close(self) -> None:
         """Run the ``endings`` before the node is destroyed, for example to save files."""
