@@ -353,3 +353,25 @@ def test_a_node_that_crashes_or_is_deaf_and_does_not_end_is_no_stopped_one(endin
     program = ENDED.replace('sys.exit(run.run(Stage))', ending) % ('pass', HOLDS_THE_INTERPRETER, 'pass', SHORT)
     done = finished(program)
     assert (done.returncode, said(done)) == (-signal.SIGALRM, ['saved'])
+
+
+@pytest.mark.parametrize(('at_the_end', 'after'), [('pass', ['again']), ('os.kill(os.getpid(), signal.SIGINT)', [])])
+def test_a_deaf_node_that_is_asked_to_stop_while_it_saves_does_not_start_again(at_the_end, after):
+    program = f"""
+import os, signal, sys
+from support.empty_stage import EmptyStage
+from thermal_fiducial.ros.process import run
+
+class Stage(EmptyStage):
+    def close(self):
+        {at_the_end}
+        print('saved', flush=True)
+
+def go_deaf(node, *_):
+    node.deaf = 'deaf'
+
+run._spin, run._start_again = go_deaf, lambda: print('again', flush=True)
+sys.exit(run.run(Stage))
+"""
+    done = finished(program)
+    assert (done.returncode, said(done), done.stderr) == (0, ['saved', *after], '')

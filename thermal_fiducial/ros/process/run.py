@@ -115,7 +115,9 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     try:
         _make_and_spin(make_node, args, stop)
     except _DeafError:
-        _start_again()
+        # It may have been asked to stop while it saved a map.
+        if not stop.asked:
+            _start_again()
     except InputError as error:
         say_last(f'{Path(sys.argv[0]).name}: {error}')
         return 2
