@@ -375,3 +375,38 @@ sys.exit(run.run(Stage))
 """
     done = finished(program)
     assert (done.returncode, said(done), done.stderr) == (0, ['saved', *after], '')
+
+
+CRASHED = "raise RuntimeError('as no guard catches')"
+
+
+@pytest.mark.parametrize(
+    ('in_flight', 'status', 'last'),
+    [
+        (CRASHED, 1, 'RuntimeError: as no guard catches'),
+        ("node.deaf = 'deaf'", 0, 'again'),
+        ('os.kill(os.getpid(), signal.SIGINT)', 2, '-c: the map is not saved: the disk is full'),
+    ],
+)
+def test_a_map_that_cannot_be_saved_keeps_no_crashed_or_deaf_node_from_starting_again(in_flight, status, last):
+    """Status 2 is that of refused parameters: launch files would not start it again, in flight."""
+    program = f"""
+import os, signal, sys
+from support.empty_stage import EmptyStage
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.process import run
+
+class Stage(EmptyStage):
+    def close(self):
+        raise InputError('the map is not saved: the disk is full')
+
+def spin(node, *_):
+    {in_flight}
+
+run._spin, run._start_again = spin, lambda: print('again', file=sys.stderr)
+sys.exit(run.run(Stage))
+"""
+    done = finished(program)
+    lines = done.stderr.splitlines()
+    assert (done.returncode, lines[-1]) == (status, last)
+    assert sum('the map is not saved: the disk is full' in line for line in lines) == 1

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 import os
 from pathlib import Path
 import sys
@@ -152,7 +153,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             executor = make_executor()
             ending.callback(executor.shutdown)
             ending.push(limit_the_end)
-            ending.callback(node.close)
+            ending.push(partial(_close, node))
             executor.add_node(node)
             # A stop request shuts the context down, which the executor reports.
             with suppress(ExternalShutdownException):
@@ -167,6 +168,16 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             if ok() and not stop.asked:
                 raise
             limit_the_end()
+
+
+def _close(node: StageNode[Any], crashed: type[BaseException] | None, *_: object) -> None:
+    """Close the node; where it ``crashed`` or is deaf that stays the reason of its end, so that it is started again."""
+    try:
+        node.close()
+    except InputError as error:
+        if crashed is None:
+            raise
+        node.get_logger().error(str(error))
 
 
 def _made(make_node: Callable[[], StageNode[Any]]) -> StageNode[Any]:
