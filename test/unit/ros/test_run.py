@@ -13,7 +13,7 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu
-from support.empty_stage import finished
+from support.empty_stage import environment, finished
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.config import group, param
@@ -97,9 +97,9 @@ print(cv2.getNumThreads(), os.environ['OPENBLAS_NUM_THREADS'])
 """
     limits = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENCV_FOR_THREADS_NUM')
     bare = {name: value for name, value in os.environ.items() if name not in limits}
-    for environment, said in ((bare, '1 1'), ({**bare, 'OPENBLAS_NUM_THREADS': '3'}, '1 3')):
+    for limited, said in ((bare, '1 1'), ({**bare, 'OPENBLAS_NUM_THREADS': '3'}, '1 3')):
         done = subprocess.run(
-            [sys.executable, '-c', program], env=environment, capture_output=True, text=True, timeout=60, check=False
+            [sys.executable, '-c', program], env=limited, capture_output=True, text=True, timeout=60, check=False
         )
         assert done.stdout.strip() == said, done.stderr
 
@@ -164,21 +164,44 @@ def test_arguments_that_ros_cannot_read_are_an_input_error(arguments):
     assert arguments[1] in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ('module', 'arguments', 'status', 'words'),
-    [
-        ('nodes.pose_ekf', [], 2, ': ROS_LOG_DIR names another folder'),
-        ('cli.main', ['watch', '--once', '--wait', '0.1'], 1, ''),
-    ],
-)
-def test_a_home_that_cannot_be_written(module, arguments, status, words):
-    """A node needs a folder for its logs, and names the variable; a command, as replay and watch, needs none."""
-    start = f'import sys; from thermal_fiducial.{module} import main; sys.exit(main())'
-    home = {name: value for name, value in os.environ.items() if name != 'ROS_LOG_DIR'} | {'ROS_HOME': '/proc/nowhere'}
-    ended = subprocess.run([sys.executable, '-c', start, *arguments], env=home, capture_output=True, text=True)
-    assert ended.returncode == status
-    assert words in ended.stderr
-    assert len(ended.stderr.splitlines()) == bool(words)
+def without_a_home(program, *arguments):
+    """What a program says and its exit status where ROS cannot write its logs."""
+    home = {name: value for name, value in environment().items() if name != 'ROS_LOG_DIR'} | {'ROS_HOME': '/proc/here'}
+    command = [sys.executable, '-c', program, *arguments]
+    return subprocess.run(command, env=home, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_node_runs_without_a_log_file():
+    """On a disk that has become read-only a node that crashed in flight ended with status 2, and stayed down."""
+    program = """
+import os, signal, sys
+from support.empty_stage import EmptyStage
+from thermal_fiducial.ros.process import run
+
+class Stage(EmptyStage):
+    def __init__(self):
+        super().__init__()
+        self.create_timer(0.01, lambda: os.kill(os.getpid(), signal.SIGINT))
+
+    def finish(self):
+        self.get_logger().info('finished')
+
+sys.exit(run.run(Stage))
+"""
+    done = without_a_home(program)
+    # Behind the last line ROS says that it does not reach /rosout any more.
+    first, last, *_ = done.stderr.splitlines()
+    assert done.returncode == 0
+    assert 'WARN' in first
+    assert "no log file: failed to initialize logging: Failed to create log directory '/proc/here/log'" in first
+    assert first.endswith('; ROS_LOG_DIR names another folder')
+    assert last.endswith('[stage]: finished')
+
+
+def test_a_command_needs_no_log_file():
+    program = 'import sys; from thermal_fiducial.cli.main import main; sys.exit(main())'
+    done = without_a_home(program, 'watch', '--once', '--wait', '0.1')
+    assert (done.returncode, done.stderr) == (1, '')
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from typing import Any
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import get_logger
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
@@ -69,10 +70,13 @@ def initialise(
 ) -> None:
     """``rclpy.init`` that raises :class:`InputError` for bad arguments or parameter files.
 
+    Where no log file can be written it goes on without: on a disk that has become read-only, a node that crashed in
+    flight is still to be started again.
+
     Raises
     ------
     InputError
-        Arguments or a parameter file that ROS cannot read, or no folder for its logs.
+        Arguments or a parameter file that ROS cannot read.
     """
     use_transport_profile()
     try:
@@ -83,10 +87,14 @@ def initialise(
             signal_handler_options=signals,
         )
     except RuntimeError as error:
+        # The log file comes last.
+        if ok(context=context):
+            line = f'no log file: {_first_line(error)}; ROS_LOG_DIR names another folder'
+            get_logger('thermal_fiducial').warning(line)
+            return
         if _is_secured() and not os.environ.get('ROS_SECURITY_KEYSTORE'):
             raise InputError('ROS_SECURITY_ENABLE is true, and ROS_SECURITY_KEYSTORE is not set') from None
-        hint = ': ROS_LOG_DIR names another folder' if 'log directory' in str(error) else ''
-        raise InputError(_first_line(error) + hint) from None
+        raise InputError(_first_line(error)) from None
 
 
 def _is_secured() -> bool:
