@@ -6,10 +6,15 @@ import re
 import runpy
 import sys
 
+import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_typestore, Stores
 import yaml
+
+from thermal_fiducial.config import NODES
+from thermal_fiducial.ros.base.node import ERROR, OK, WARN
+from thermal_fiducial.ros.messages import convert
 
 ROOT = Path(__file__).resolve().parents[3]
 LAYOUT = ROOT / 'config' / 'thermal_fiducial_foxglove.json'
@@ -25,7 +30,6 @@ KINDS = {
         'visualization_msgs/MarkerArray',
     },
     'imageTopic': {'sensor_msgs/Image'},
-    'calibrationTopic': {'sensor_msgs/CameraInfo'},
     'annotations': {'foxglove_msgs/ImageAnnotations'},
     'topicToRender': {'diagnostic_msgs/DiagnosticArray'},
 }  # fmt: skip
@@ -39,10 +43,16 @@ def kind_of():
 
 
 @pytest.fixture(scope='module')
-def published():
-    """Topics that the documents list as published."""
+def described():
+    """Topic to its description in the documents, of those that the nodes publish."""
     nodes = yaml.safe_load((ROOT / 'doc' / 'interfaces.yaml').read_text())
-    return {f'/{topic.strip("/")}' for node in nodes.values() for topic in node.get('out', {})} | {'/diagnostics'}
+    return {f'/{topic.strip("/")}': text for node in nodes.values() for topic, text in node.get('out', {}).items()}
+
+
+@pytest.fixture(scope='module')
+def published(described):
+    """Topics that the documents list as published."""
+    return {*described, '/diagnostics'}
 
 
 def panels(place):
@@ -61,7 +71,7 @@ def test_the_panels_of_foxglove_are_those_that_are_configured():
         shown += [tab['layout'] for tab in layout['configById'][name].get('tabs', [])]
     assert sorted(shown) == sorted(layout['configById'])
     kinds = [name.partition('!')[0] for name in shown]
-    assert {'3D', 'Image', 'Plot', 'DiagnosticSummary'} <= set(kinds)
+    assert {'3D', 'Image', 'Plot', 'DiagnosticSummary', 'StateTransitions'} <= set(kinds)
 
 
 def test_foxglove_shows_path_map_covariances_and_detections(published):
@@ -71,8 +81,8 @@ def test_foxglove_shows_path_map_covariances_and_detections(published):
     assert all(space['topics'][topic]['showCovariance'] for topic in ('/pose', '/camera_pose'))
     overlaid, drawn = (panels[name]['imageMode'] for name in ('Image!camera', 'Image!drawn'))
     assert overlaid['annotations'] == {'/thermal/image_annotations': {'visible': True}}
-    topics = {overlaid['imageTopic'], overlaid['calibrationTopic'], drawn['imageTopic'], *overlaid['annotations']}
-    paths = [path['value'] for name, panel in panels.items() if name.startswith('Plot') for path in panel['paths']]
+    topics = {overlaid['imageTopic'], drawn['imageTopic'], *overlaid['annotations']}
+    paths = [path['value'] for panel in panels.values() for path in panel.get('paths', [])]
     topics |= {re.match(r'/\w+', path)[0] for path in paths} | {panels['DiagnosticSummary!nodes']['topicToRender']}
     assert topics <= published
 
@@ -82,8 +92,7 @@ def test_foxglove_s_panels_can_draw_what_the_topics_are(kind_of):
     assert {kind_of[topic] for topic in panels['3D!map']['topics']} <= KINDS['3D!map']
     for name in ('Image!camera', 'Image!drawn'):
         mode = panels[name]['imageMode']
-        for key in ('imageTopic', 'calibrationTopic'):
-            assert key not in mode or kind_of[mode[key]] in KINDS[key]
+        assert kind_of[mode['imageTopic']] in KINDS['imageTopic']
         assert {kind_of[topic] for topic in mode.get('annotations', {})} <= KINDS['annotations']
     assert kind_of[panels['DiagnosticSummary!nodes']['topicToRender']] in KINDS['topicToRender']
 
@@ -94,13 +103,51 @@ def test_the_curves_of_foxglove_are_fields_of_the_messages(kind_of):
     curves = [path['value'] for name, panel in panels.items() if name.startswith('Plot') for path in panel['paths']]
     assert curves
     for curve in curves:
-        topic, *names = re.split(r'\.', re.sub(r'\[\d+\]$', '', curve))
+        topic, *names = re.sub(r'\[\d+\](\.@sqrt)?$', '', curve).split('.')
         package, name = kind_of[topic].split('/')
         kind = (Nodetype.NAME, f'{package}/msg/{name}')
         for field in names:
             kind = dict(fields[kind[1]][1])[field]
         element = kind[1][0] if kind[0] == Nodetype.ARRAY else kind
         assert element == (Nodetype.BASE, ('float64', 0)), curve
+
+
+def test_foxglove_draws_standard_deviations():
+    """Variances were near 1e-6 m^2, with 17 digits in the legend, and the start of a flight hid all that came after."""
+    panel = json.loads(LAYOUT.read_text())['configById']['Plot!deviation']
+    assert panel['foxglovePanelTitle'] == 'Standard deviation of the position [m]'
+    assert [path['value'] for path in panel['paths']] == [
+        f'/odometry.pose.covariance[{place}].@sqrt' for place in np.ravel_multi_index(([0, 1, 2], [0, 1, 2]), (6, 6))
+    ]
+
+
+def test_foxglove_shows_at_a_glance_whether_the_pose_may_be_flown_on():
+    """The level of the filter over time, and the row of the filter first; a row without news becomes stale."""
+    panels = json.loads(LAYOUT.read_text())['configById']
+    name = 'pose_ekf'
+    assert name in NODES
+    (status,) = convert.diagnostics(name, OK, '', {}, 0).status
+    (state,) = panels['StateTransitions!pose']['paths']
+    assert state['value'] == f'/diagnostics.status[:]{{name=="{status.name}"}}.level'
+    labels = {entry['value']: entry['label'] for entry in state['customStates']['states']}
+    title = panels['StateTransitions!pose']['foxglovePanelTitle']
+    assert title == 'Pose: ' + ', '.join(f'{level} {label}' for level, label in labels.items())
+    assert list(labels) == [str(level[0]) for level in (OK, WARN, ERROR)]
+    rows = panels['DiagnosticSummary!nodes']
+    assert rows['pinnedIds'] == [f'|{status.hardware_id}|{status.name}|']
+    # Diagnostics come once a second; a late one must not make a row stale.
+    assert 1 < rows['secondsUntilStale'] <= 3
+
+
+def test_the_image_that_foxglove_opens_with_needs_no_parameter(described):
+    """Outlines that need ``image_annotations: true`` were in the first tab, which showed none with the defaults."""
+    panels = json.loads(LAYOUT.read_text())['configById']
+    tab = panels['Tab!image']
+    shown = panels[tab['tabs'][tab['activeTabIdx']]['layout']]['imageMode']
+    description = described[shown['imageTopic']]
+    assert 'outlines' in description
+    assert ': true`' not in description
+    assert 'annotations' not in shown
 
 
 def made(library, name, settings, **parts):
@@ -128,6 +175,14 @@ def test_foxglove_s_own_library_knows_every_setting(kind_of):
         if kind == 'Plot':
             paths = [made(library, 'PlotSeries', path) for path in settings['paths']]
             config = made(library, 'PlotConfig', settings, paths=paths)
+        elif kind == 'StateTransitions':
+            (path,) = settings['paths']
+            custom = path['customStates']
+            assert custom['type'] == 'discrete'
+            states = [made(library, 'StateTransitionsDiscreteCustomState', state) for state in custom['states']]
+            states = library.StateTransitionsDiscreteCustomStates(states=states)
+            paths = [made(library, 'StateTransitionsSeries', path, customStates=states)]
+            config = made(library, 'StateTransitionsConfig', settings, paths=paths)
         elif kind == 'DiagnosticSummary':
             config = made(library, 'DiagnosticsSummaryConfig', settings)
         elif kind == 'Image':
@@ -147,10 +202,12 @@ def test_foxglove_s_own_library_knows_every_setting(kind_of):
         assert json.loads(config.to_json()) == settings, name
 
 
-def test_annotations_lie_on_the_image_as_it_is_published():
-    """Corners are those of the raw image: where a panel rectifies it, they would lie beside the markers."""
+def test_images_are_shown_as_they_are_published():
+    """With a calibration Studio rectifies the image, waits for it, and shows none for an ``equidistant`` lens."""
     panels = json.loads(LAYOUT.read_text())['configById']
-    assert all(panels[name]['imageMode']['rectifyImage'] is False for name in ('Image!camera', 'Image!drawn'))
+    for name in ('Image!camera', 'Image!drawn'):
+        assert panels[name]['imageMode']['rectifyImage'] is False
+        assert 'calibrationTopic' not in panels[name]['imageMode']
 
 
 def test_rviz_shows_published_topics(published):
