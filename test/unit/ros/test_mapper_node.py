@@ -136,7 +136,8 @@ def test_a_cloud_that_cannot_be_read_is_a_fault(graph, tmp_path, map_file):
     assert 'none.ply' in reason
 
 
-def test_all_markers_are_drawn_once_and_then_those_that_change_colour(graph, tmp_path, monkeypatch):
+def test_each_drawing_of_the_map_is_complete(graph, tmp_path, monkeypatch):
+    """Of a recorded flight, Foxglove showed those markers alone that had changed colour last before where it began."""
     path = tmp_path / 'map.yaml'
     save_map(path, MarkerMap({i: MapMarker(i, 0.3, True, transform(np.eye(3), [i, 0.0, 0.0])) for i in range(3)}))
     node = graph.add(MarkerMapperNode, map_file=str(path))
@@ -154,9 +155,11 @@ def test_all_markers_are_drawn_once_and_then_those_that_change_colour(graph, tmp
     graph.send('markers', clouds.cloud(np.zeros(0, MARKER_DTYPE), convert.header(1, 'camera')))
     graph.diagnose(node)
     graph.spin_until(lambda: len(heard) == 3)
-    assert [(m.ns, m.id, m.action, m.color.r > 0.5) for m in heard[2].markers if m.ns == 'plates'] == [
-        ('plates', 1, Marker.ADD, True)
-    ]
+    red = {m.id: m.color.r > 0.5 for m in heard[2].markers if m.ns == 'plates'}
+    assert red == {0: False, 1: True, 2: False}
+    assert [m.text for m in heard[2].markers if m.ns == 'ids'] == ['0', '1', '2']
+    assert heard[2].markers[0].action == Marker.DELETEALL
+    assert {m.header.stamp.nanosec for m in heard[2].markers} == {1}
     # Nothing has changed: nothing is drawn. Another map: all of it is.
     graph.diagnose(node)
     assert graph.call(Trigger, 'marker_mapper/reset', Trigger.Request()).success
@@ -165,28 +168,23 @@ def test_all_markers_are_drawn_once_and_then_those_that_change_colour(graph, tmp
     assert len(heard[3].markers) == 7
 
 
-def test_a_subscriber_in_place_of_another_is_drawn_all_markers(graph, tmp_path, monkeypatch):
-    """RViz that was started again within a second kept the few markers that had changed colour last."""
+def test_a_subscriber_in_place_of_another_is_drawn_all_markers(graph, tmp_path):
+    """A display that is added to RViz by hand is volatile: what is latched does not reach it."""
     path = tmp_path / 'map.yaml'
     save_map(path, MarkerMap({i: MapMarker(i, 0.3, True, transform(np.eye(3), [i, 0.0, 0.0])) for i in range(3)}))
     node = graph.add(MarkerMapperNode, map_file=str(path))
     topic, drawing = 'marker_map/markers', graph.output(node, 'marker_map/markers')
-    first = graph.tester.create_subscription(MarkerArray, topic, lambda _: None, qos.LATCHED)
+    first = graph.tester.create_subscription(MarkerArray, topic, lambda _: None, qos.RESULT)
     graph.spin_until(lambda: drawing.listeners == 1)
-    graph.diagnose(node)
-    monkeypatch.setattr(node.mapper, 'learn', lambda _: MapperResult(1, None, '', in_view=frozenset({1})))
-    graph.send('thermal/camera_info', info())
-    graph.send('markers', clouds.cloud(np.zeros(0, MARKER_DTYPE), convert.header(1, 'camera')))
     graph.diagnose(node)
     graph.tester.destroy_subscription(first)
     graph.spin_until(lambda: drawing.listeners == 0)
-    graph.listen(MarkerArray, topic, qos.LATCHED)
+    graph.listen(MarkerArray, topic, qos.RESULT)
     heard = graph.heard[topic]
-    graph.spin_until(lambda: drawing.listeners == 1 and heard)
-    assert {m.id for m in heard[0].markers} == {1}
+    graph.spin_until(lambda: drawing.listeners == 1)
     graph.diagnose(node)
-    graph.spin_until(lambda: len(heard) == 2)
-    assert [m.id for m in heard[1].markers if m.ns == 'plates'] == [0, 1, 2]
+    graph.spin_until(lambda: heard)
+    assert [m.id for m in heard[0].markers if m.ns == 'plates'] == [0, 1, 2]
 
 
 def test_a_calibration_that_a_second_camera_repeats_is_validated_once(graph, map_file, monkeypatch, capfd):

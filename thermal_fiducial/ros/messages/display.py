@@ -20,15 +20,20 @@ _BGR_EDGE = (0, 0, 255)
 _BGR_FIRST_CORNER = (0, 255, 255)
 
 
-def map_markers(rows: 'np.ndarray[Any, np.dtype[Any]]', head: Header, *, whole: bool = True) -> MarkerArray:
-    """Plates and IDs of the rows (N,) of a marker map: red in view, green out of view, grey if distrusted.
-
-    ``whole``: delete all earlier drawings first; else redraw only these.
-    """
-    array = MarkerArray(markers=[Marker(header=head, action=Marker.DELETEALL)] if whole else [])
+def map_markers(rows: 'np.ndarray[Any, np.dtype[Any]]', head: Header) -> MarkerArray:
+    """Plates and IDs of the rows (N,) of a marker map, in place of all earlier ones."""
+    array = MarkerArray(markers=[Marker(header=head, action=Marker.DELETEALL)])
     for row in rows:
         array.markers += [_plate(row, head), _label(row, head)]
     return array
+
+
+def recolour(array: MarkerArray, rows: 'np.ndarray[Any, np.dtype[Any]]', head: Header) -> None:
+    """Give a drawing the header and the colours of today; ``rows`` (N,) are those that it was made of."""
+    for marker in array.markers:
+        marker.header = head
+    for plate, row in zip(array.markers[1::2], rows, strict=True):
+        plate.color = _colour(row)
 
 
 def _plate(row: Any, head: Header) -> Marker:
@@ -37,8 +42,13 @@ def _plate(row: Any, head: Header) -> Marker:
         header=head, ns='plates', id=int(row['id']), type=Marker.CUBE, action=Marker.ADD, pose=convert.pose_of_row(row)
     )
     marker.scale = Vector3(x=size, y=size, z=_THICKNESS)
-    marker.color = _IN_VIEW if row['in_view'] else _OUT_OF_VIEW if row['trusted'] else _DISTRUSTED
+    marker.color = _colour(row)
     return marker
+
+
+def _colour(row: Any) -> ColorRGBA:
+    """Red in view, green out of view, grey if distrusted."""
+    return _IN_VIEW if row['in_view'] else _OUT_OF_VIEW if row['trusted'] else _DISTRUSTED
 
 
 def _label(row: Any, head: Header) -> Marker:
