@@ -203,7 +203,7 @@ def test_foxglove_s_own_library_knows_every_setting(kind_of):
 
 
 def test_images_are_shown_as_they_are_published():
-    """With a calibration Studio rectifies the image, waits for it, and shows none for an ``equidistant`` lens."""
+    """With a calibration Studio rectifies the image, not the outlines; it shows none behind an ``equidistant`` lens."""
     panels = json.loads(LAYOUT.read_text())['configById']
     for name in ('Image!camera', 'Image!drawn'):
         assert panels[name]['imageMode']['rectifyImage'] is False
