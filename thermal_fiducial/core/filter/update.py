@@ -41,6 +41,10 @@ from thermal_fiducial.core.types import FloatArray
 #: offset, 1 to 2 times n' diag(S^-1) n, growing with the gain. It is taken away; the offset's variance at most doubles
 #: in one step.
 _SPURIOUS, _LEAST_KEPT = 1.5, 0.5
+#: Variance of the position that an estimate may give up to go on in the map of worse markers, as a share of what its
+#: own map is off by. From 0.03 to 0.3 recorded carpets and random rigs are alike; with less the estimate stays in its
+#: map for long, and the IMU decides between maps, off by the error of the mount.
+_LITTLE = 0.1
 _SIX = np.arange(6)
 #: Copied for every update, as an update leaves its results in the object.
 _ALGEBRA = ExtendedKalmanFilter(dim_x=SIZE, dim_z=6)
@@ -206,8 +210,8 @@ def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estim
 def _with_markers(estimate: Estimate, pose: BodyPose) -> Estimate:
     """The estimate with the map's error propagated to the markers of ``pose``: a random walk from those of the last.
 
-    The estimate goes on in the map as they have it where that is better than its own, or differs by less than the
-    estimate is uncertain. So poor markers take away nothing that it knows.
+    The estimate goes on in the map as they have it where that is better than its own, or where little is lost by it.
+    So poor markers take away nothing that it knows.
     """
     noise, P = estimate.pose_noise, estimate.covariance.copy()
     now = pose.after(noise.last, estimate.state.T_map_body)
@@ -216,8 +220,10 @@ def _with_markers(estimate: Estimate, pose: BodyPose) -> Estimate:
     since_last, apart = now.map_changes(np.stack((noise.last.map_covariance, noise.of_map)))
     P[MARKERS, MARKERS] += since_last
     estimate = replace(estimate, covariance=P)
-    is_worse = now.moved_by(now.map_covariance) > now.moved_by(noise.of_map)
-    if is_worse and now.moved_by(apart) > P[POSITION, POSITION].trace():
+    of_map, of_change, own = now.moved_by(noise.of_map), now.moved_by(apart), P[POSITION, POSITION].trace()
+    # In a map of its own the estimate would know its place by the markers and by itself, in theirs by them alone.
+    lost = of_change - of_change * own / (of_change + own)
+    if now.moved_by(now.map_covariance) > of_map and lost > _LITTLE * of_map:
         return estimate
     if now.moved_by(P[MARKERS, MARKERS]) > now.moved_by(apart):
         # The random walk knows less than the two covariances: the markers in between were worse.

@@ -381,6 +381,19 @@ def test_worse_markers_take_nothing_away_from_what_is_known(estimate, still):
     assert after.position_std <= begun.position_std * (1.0 + 1e-6)
 
 
+def test_of_a_drifted_estimate_and_poorly_mapped_markers_both_are_used(estimate, still):
+    """After a gap the estimate is off by 0.25 m in a map known to 1 mm, the markers that show then by 0.2 m."""
+    T, R = estimate.state.T_map_body, 1e-6 * np.eye(6)
+    turns_no_more = np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    P = 1e-12 * np.eye(SIZE)
+    P[POSITION, POSITION] = 0.25**2 / 3.0 * np.eye(3)
+    own_map = PoseNoise.of(BodyPose(T, R, 1e-6 / 3.0 * turns_no_more))
+    drifted = replace(estimate, covariance=P, pose_noise=own_map)
+    after = corrected(FULL, innovation_of(FULL, drifted, BodyPose(T, R, 0.2**2 / 3.0 * turns_no_more), still))
+    # Two independent errors; to the white and lasting errors of the pose, 2 mm, and the error of its own map.
+    assert after.position_std == pytest.approx((0.25**-2 + 0.2**-2) ** -0.5, rel=0.02)
+
+
 def test_a_motion_of_the_map_moves_pose_velocity_and_gravity(estimate):
     state, step = estimate.state, 1e-6
     for column in range(6):
