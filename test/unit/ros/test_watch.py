@@ -95,6 +95,20 @@ def test_silence_is_no_pose():
     assert unheard.snapshot(0.5).reasons[0] == 'no odometry is heard, but pose_ekf says: tracking'
 
 
+def test_odometry_alone_is_no_pose_to_fly_on():
+    """It is published while the pose is lost, too, as only the filter's diagnostics say."""
+    status = LiveStatus()
+    for k in range(800):
+        status.odometry(k * 0.005, 0.002, 0.004, 0.05)
+    snapshot = status.snapshot(4.0)
+    assert (snapshot.advice, snapshot.reasons[0]) == (Advice.STOP, 'pose_ekf says nothing')
+    assert 'markers' not in snapshot.line, 'a topic that is not heard shows no 0'
+    mute = flying()
+    for k in range(800, 1600):
+        mute.odometry(k * 0.005, 0.002, 0.004, 0.05)
+    assert mute.snapshot(8.0).headline.startswith('The pose must not be flown on: pose_ekf says nothing')
+
+
 def test_what_keeps_the_pose_away_is_named_beside_it():
     """It said that the pose is lost, but not that the camera was unplugged."""
     said = {'pose_ekf': (2, 'lost: position known to 0.41 m'), 'tau2_camera': (2, 'nothing on thermal/image_raw')}

@@ -171,7 +171,9 @@ class LiveStatus:
     def snapshot(self, now: float) -> LiveState:
         """The state at a time."""
         # Cares, too, with stops: a pose is lost, say, because the camera has stopped.
-        stops, cares = self._stops(now), self._cares(now) if self._nodes else []
+        stops = self._stops(now)
+        # If nothing at all is heard, a line for each stage adds nothing.
+        cares = [] if stops and not self._nodes else self._cares(now)
         advice = Advice.STOP if stops else Advice.CARE if cares else Advice.FLY
         return LiveState(
             advice=advice,
@@ -194,7 +196,10 @@ class LiveStatus:
         reasons = []
         if (silent := self._odometry.silent(now)) > SILENT_S:
             reasons.append(f'no odometry for {silent:.1f} s')
-        if filter_ is not None and (filter_.level > _WARNING or filter_.figures.get('lost') == 'True'):
+        if filter_ is None or now - filter_.time > MUTE_S:
+            # Odometry is published while the pose is lost, too.
+            reasons.append(_silence_of(_FILTER))
+        elif filter_.level > _WARNING or filter_.figures.get('lost') == 'True':
             reasons.append(filter_.message)
         return reasons
 
@@ -204,7 +209,7 @@ class LiveStatus:
         for node in STAGES:
             said = self._nodes.get(node)
             if said is None or now - said.time > MUTE_S:
-                reasons.append(f'{node} says nothing')
+                reasons.append(_silence_of(node))
             elif said.level == _WARNING and node == _CAMERA and SHUTTER in said.message:
                 continue  # normal operation
             elif said.level != _OK:
@@ -220,15 +225,15 @@ class LiveStatus:
         return node, said.level, said.message
 
     def _readings(self, now: float) -> tuple[LiveFigure, ...]:
-        in_view = self._markers if self._frames.silent(now) < WINDOW_S else ()
-        listed = ' '.join(str(marker) for marker in in_view)
+        listed = ' '.join(str(marker) for marker in self._markers)
+        in_view = f'{len(self._markers)}' + (f' ({listed})' if listed else '')
         sigma_m, sigma_deg = self._sigma if self._sigma and self._odometry.silent(now) < WINDOW_S else (None, None)
         said = self._nodes.get(_FILTER)
         figures: Mapping[str, str] = said.figures if said is not None and now - said.time <= MUTE_S else {}
         offset, offset_std = _milliseconds(figures, 'time offset'), _milliseconds(figures, 'time offset std')
         known = offset is not None and offset_std is not None
         return (
-            LiveFigure('markers in view', f'{len(in_view)}' + (f' ({listed})' if listed else '')),
+            LiveFigure('markers in view', in_view if self._frames.silent(now) < WINDOW_S else ''),
             LiveFigure('poses', self._odometry.rate(now), 'Hz'),
             LiveFigure('camera poses', self._camera_pose.rate(now), 'Hz'),
             LiveFigure('latency', self._odometry.latency, 'ms'),
@@ -238,6 +243,10 @@ class LiveStatus:
             LiveFigure('clock offset', f'{offset:.1f} +- {offset_std:.1f}' if known else '', 'ms'),
             LiveFigure('usable without markers', _rounded(figures, 'usable for'), 's'),
         )
+
+
+def _silence_of(node: str) -> str:
+    return f'{node} says nothing'
 
 
 def _milliseconds(figures: Mapping[str, str], name: str) -> float | None:
