@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+import re
 from typing import Any, NoReturn, TypeAlias
 
 from thermal_fiducial.cli.subcommands import any_path
@@ -48,6 +49,8 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **options: Any) -> None:
         super().__init__(**{'formatter_class': _Help, **options})
         self.register('type', Path, any_path)
+        # Programs print -0.00003 as -3e-05, which argparse before Python 3.14 takes for an option.
+        self._negative_number_matcher = re.compile(r'-\.?\d')
         self._rules: list[_Rule] = []
         self._given: set[str] = set()
 

@@ -98,6 +98,12 @@ def test_check_names_a_dictionary_that_cannot_be_opened(name, path, capsys):
     assert run('rename', path, 4, 4000) == 0
 
 
+def test_negative_numbers_as_programs_print_them(path):
+    """Python prints -0.00003 as -3e-05, which argparse took for an option."""
+    assert run('move', path, 3, '--position', '-1.', '-.5', '-3e-05', '--orientation', '-3E-06', 0, 0, 1) == 0
+    assert load_map(path).markers[3].T_map_marker[:3, 3].tolist() == [-1.0, -0.5, -3e-5]
+
+
 def test_edits_make_versions_that_can_be_undone(path, poses, capsys):
     first = path.read_bytes()
     assert run('fix', path, 1, 2) == 0
