@@ -57,6 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Exit status: 0 done, 1 something failed on the way, 2 wrong usage or unusable input, 130 interrupted.
     """
     words = sys.argv[1:] if argv is None else list(argv)
+    _replace_closed_streams()
     _allow_any_letter()
     with Interrupts(held=False) as interrupts:
         status = _finished(words, interrupts)
@@ -120,6 +121,13 @@ def _reported(error: BaseException) -> tuple[int, str] | None:
 def _on_one_line(words: str) -> str:
     """A message with what was given, whose letters may be any, without the unprintable ones."""
     return ''.join(letter if letter.isprintable() else '?' for letter in words)
+
+
+def _replace_closed_streams() -> None:
+    """Write to nowhere what a caller has closed (``>&-``): Python has none then, and files would get its number."""
+    for name in ('stdout', 'stderr'):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), 'w'))
 
 
 def _allow_any_letter() -> None:

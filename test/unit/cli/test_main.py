@@ -242,6 +242,16 @@ def test_output_that_takes_nothing_or_not_every_letter(tmp_path, output, encodin
     assert (done.returncode, done.stderr) == expected
 
 
+@pytest.mark.parametrize('closed', ['>&-', '2>&-', '>&- 2>&-'])
+def test_a_command_runs_with_its_output_closed(tmp_path, closed):
+    """As a service manager may start it: without stdout it ended with a traceback and status 1."""
+    path = tmp_path / 'map.yaml'
+    save_map(path, map_of((0, 1)))
+    shell = f'"$0" -m thermal_fiducial map check "$1" {closed}'
+    done = subprocess.run(['sh', '-c', shell, sys.executable, str(path)], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, '')
+
+
 def test_a_demo_that_cannot_be_flown_leaves_the_earlier_one(tmp_path, capsys):
     (tmp_path / '.thermal_fiducial_demo').touch()
     (tmp_path / 'report.html').touch()
