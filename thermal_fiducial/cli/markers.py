@@ -71,12 +71,16 @@ def _check(args: argparse.Namespace) -> int:
         print(f'{times} of {number_of(len(ids), "marker")}: {complaint}')
     between, own = distances(bits[ids])
     # Nearer than markers of the dictionary are to one another: of few markers that are chosen these may be far apart.
-    pairs = negatives(bits[ids], distances(bits)[0])
+    least = distances(bits)[0]
+    pairs = negatives(bits[ids], least)
     for a, b, bits_apart in pairs:
         print(f'marker {ids[a]} and the negative of {ids[b]} differ in {number_of(bits_apart, "bit")}')
     if pairs:
-        signed = ' and '.join(sorted(path.stem for path in PACKAGED.glob('*_SIGNED.yaml')))
-        print(f'only the border shows the polarity of these: set polarity, or use {signed}, which have none')
+        signed = ' or '.join(sorted(path.stem for path in PACKAGED.glob('*_SIGNED.yaml')))
+        print(
+            f'these are nearer to a negative than markers to one another ({number_of(least, "bit")}): where warm '
+            f'plates in front of a cold surface may appear too, set polarity, or use {signed}, which have none'
+        )
     apart = f'distance between markers {between}, ' if len(ids) > 1 else 'distance '
     print(f'{good} of {number_of(len(ids), "marker")} can be cut; {apart}to own rotations {own}')
     return 0

@@ -100,9 +100,18 @@ def test_check_names_markers_that_are_negatives_of_one_another(capsys):
     assert main(['markers', 'check', '--mount', 'none', '--ids', ','.join(map(str, first))]) == 0
     printed = capsys.readouterr().out
     assert f'marker {first[0]} and the negative of {first[1]} differ in 0 bits' in printed
-    assert 'use STENCIL_4X4_80_SIGNED and STENCIL_5X5_100_SIGNED, which have none' in printed
+    assert 'use STENCIL_4X4_80_SIGNED or STENCIL_5X5_100_SIGNED, which have none' in printed
     assert main(['markers', 'check', '--mount', 'none', '--dictionary', 'STENCIL_4X4_80_SIGNED', '--ids', '0-5']) == 0
     assert 'negative' not in capsys.readouterr().out
+
+
+def test_negatives_that_bits_distinguish_are_not_said_to_be_alike(capsys):
+    """Of markers 8 bits away from a negative it said that only the border shows their polarity."""
+    assert main(['markers', 'check', '--mount', 'none', '--dictionary', 'STENCIL_6X6_100', '--ids', '0,35']) == 0
+    printed = capsys.readouterr().out
+    assert 'marker 0 and the negative of 35 differ in 8 bits' in printed
+    assert 'nearer to a negative than markers to one another (12 bits)' in printed
+    assert 'only the border' not in printed
 
 
 def test_check_names_a_marker_that_looks_the_same_upside_down(capsys):
