@@ -28,7 +28,7 @@ def write_atomically(path: Path, text: str) -> None:
     OSError
         From the file system; the old file is then unchanged.
     """
-    path = _target(path)
+    path = target(path)
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, 'not a regular file')
     descriptor, name = tempfile.mkstemp(prefix=f'.{path.name}.', suffix='.tmp', dir=path.parent)
@@ -57,7 +57,7 @@ def sync_folder(folder: Path) -> None:
 
 def clean_up(path: Path) -> None:
     """Remove temporary files of killed writers of ``path``; only under :func:`locked`."""
-    path = _target(path)
+    path = target(path)
     for litter in path.parent.glob(f'.{glob.escape(path.name)}.*.tmp'):
         litter.unlink(missing_ok=True)
 
@@ -75,7 +75,7 @@ def locked(path: Path) -> Iterator[None]:
     """
     folder = path.parent
     try:
-        folder = _target(path).parent
+        folder = target(path).parent
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
         raise InputError(f'{folder}: {error.strerror}') from None
@@ -101,7 +101,7 @@ def _wait_for(descriptor: int, folder: Path) -> None:
             return
 
 
-def _target(path: Path) -> Path:
+def target(path: Path) -> Path:
     """``path`` with symbolic links resolved. Raises OSError for a cycle of links."""
     try:
         return path.resolve()

@@ -12,7 +12,7 @@ import re
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.atomic import clean_up, locked, sync_folder, write_atomically
+from thermal_fiducial.files.atomic import clean_up, locked, sync_folder, target, write_atomically
 from thermal_fiducial.files.map_format import parse_document
 from thermal_fiducial.files.marker_map import dump_map
 from thermal_fiducial.files.reading import read_bytes, read_text, TEXT_LIMIT_BYTES
@@ -53,12 +53,21 @@ class MapVersion:
 
 def history_folder(path: Path) -> Path:
     """Folder of the earlier versions of the map at ``path``."""
-    return path.with_name(f'{path.name}.history')
+    return _beside(path, 'history')
 
 
 def autosave_file(path: Path) -> Path:
     """Autosave file of the map at ``path``."""
-    return path.with_name(f'{path.name}.autosave')
+    return _beside(path, 'autosave')
+
+
+def _beside(path: Path, ending: str) -> Path:
+    """A path beside the file itself, as a symbolic link may lead to the map of another place tomorrow."""
+    file = path
+    # Links that lead round are reported by whoever reads or writes the map.
+    with suppress(OSError):
+        file = target(path) if path.is_symlink() else path
+    return file.with_name(f'{file.name}.{ending}')
 
 
 def digest(path: Path) -> str:

@@ -222,6 +222,22 @@ def test_two_writers_lose_no_edit(path):
         np.testing.assert_allclose(found.markers[i].T_map_marker[:3, 3], [i, 7.0, 7.0])
 
 
+def test_a_link_leads_to_the_history_and_the_autosave_of_its_file(path, tmp_path):
+    """They lay beside the link: pointed at another hall, it offered the maps of the one before for undo."""
+    link = tmp_path / 'current.yaml'
+    link.symlink_to(path)
+    map_history.save_with_history(link, grown(2), 'fly')
+    autosaved(keeper_of(link), grown(3))
+    assert [entry.action for entry in map_history.entries(path)] == ['fly']
+    assert map_history.autosaved(path).revision == 3
+    other = path.with_name('other.yaml')
+    save_map(other, grown(5))
+    link.unlink()
+    link.symlink_to(other)
+    assert map_history.entries(link) == []
+    assert map_history.autosaved(link) is None
+
+
 def test_undo_survives_broken_entries_and_strange_names(path):
     save = map_history.save_with_history
     for revision in (2, 3, 4):
