@@ -111,8 +111,8 @@ class MapKeeper:
 
         It leaves :attr:`unsaved` to whoever has copied the map: more may have been learned since.
 
-        If that folder cannot be written to (full or read-only disk), a flown map is saved in the folder of the
-        filter's last pose, or else in a new temporary folder.
+        If that folder cannot be written to (full or read-only disk), a flown map is saved in the folder where the
+        filter keeps its clock offset, or else in a new temporary folder.
 
         Returns
         -------
