@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -38,6 +39,7 @@ class Parameters:
     count: int = param(3, 'Count.', minimum=1)
     sizes: tuple[str, ...] = param((), 'Sizes.')
     weights: tuple[float, ...] = param((), 'Weights.', dynamic=True)
+    place: tuple[float, ...] = param((0.0, 0.0), 'Place.')
     inner: Inner = group(Inner)  # noqa: RUF009
 
 
@@ -67,6 +69,9 @@ def test_parameters_come_from_a_file(tmp_path):
         ('count:=1.5', 'count'),
         ('name:=c', "'c' is not one of a, b"),
         ('inner.gain:=9.0', 'inner.gain'),
+        ('inner.gain:=2', 'ROS refuses whole numbers here, write 2.0'),
+        ('place:=[1, 0]', r'ROS refuses whole numbers here, write \[1.0, 0.0\]'),
+        ('place:=1', 'expecting type'),
         ('sizes:=[1, 2]', 'sizes'),
     ],
 )
@@ -162,6 +167,18 @@ def test_arguments_that_ros_cannot_read_are_an_input_error(arguments):
         run.initialise(['--ros-args', *arguments], Context())
     assert '\n' not in str(caught.value)
     assert arguments[1] in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'remedy'),
+    [
+        (['-p', 'place:=[0, 0.5]'], ': among decimal numbers write 0.0 for 0'),
+        (['-r', '__ns:=drone1'], ': a namespace begins with a slash, as /drone1'),
+    ],
+)
+def test_errors_in_the_words_of_ros_have_a_remedy(arguments, remedy):
+    with pytest.raises(InputError, match=re.escape(remedy)):
+        run.initialise(['--ros-args', *arguments], Context())
 
 
 def without_a_home(program, *arguments):

@@ -35,8 +35,8 @@ def declare(node: Node, kind: type[Config]) -> Config:
     """
     # rclpy has no public access to the overrides, and automatically_declare_parameters_from_overrides fails on an
     # empty list, which has no type.
-    given = set(getattr(node, '_parameter_overrides', {}))
-    check_names(given - {name for name, _, _ in parameters(kind)})
+    given = getattr(node, '_parameter_overrides', {})
+    check_names(set(given) - {name for name, _, _ in parameters(kind)})
     if any(name.startswith(QOS_OVERRIDES) for name in given):
         node.get_logger().warning(f'parameters {QOS_OVERRIDES}*: ignored, the quality of service is fixed')
     for name, item, default in parameters(kind):
@@ -44,8 +44,20 @@ def declare(node: Node, kind: type[Config]) -> Config:
             _declare(node, name, item, default)
         except ParameterException as error:
             reason = str(error).removesuffix(f': {name}')
-            raise InputError(f'parameter {name}: {reason}') from None
+            raise InputError(f'parameter {name}: {_remedy(given.get(name), default) or reason}') from None
     return from_mapping(kind, current_values(node, kind))
+
+
+def _remedy(given: Parameter | None, default: Any) -> str:
+    """What to write in place of whole numbers, which ROS refuses for others; empty for another fault."""
+    several = isinstance(default, tuple)
+    if given is None or isinstance(given.value, list) != several:
+        return ''
+    values, due = (given.value, default[:1]) if several else ([given.value], (default,))
+    if {type(value) for value in due} != {float} or {type(value) for value in values} != {int}:
+        return ''
+    written = ', '.join(str(float(value)) for value in values)
+    return f'ROS refuses whole numbers here, write {f"[{written}]" if several else written}'
 
 
 def follow(node: Node, kind: type[Config], apply: Callable[[Config], None]) -> None:

@@ -58,6 +58,13 @@ def make_executor(context: Context | None = None) -> Any:
     return EventsExecutor(context=context)
 
 
+#: What to do about an error of rcl, by a part of its message.
+_HINTS = {
+    'Sequence should be of same type': ': among decimal numbers write 0.0 for 0',
+    '__ns:=': ': a namespace begins with a slash, as /drone1',
+}
+
+
 #: Arguments of what runs for a command and not on a robot: no files in ~/.ros/log, which may not be writable.
 OF_A_COMMAND = ('--ros-args', '--disable-external-lib-logs')
 
@@ -94,7 +101,8 @@ def initialise(
             return
         if _is_secured() and not os.environ.get('ROS_SECURITY_KEYSTORE'):
             raise InputError('ROS_SECURITY_ENABLE is true, and ROS_SECURITY_KEYSTORE is not set') from None
-        raise InputError(_first_line(error)) from None
+        hint = next((hint for part, hint in _HINTS.items() if part in str(error)), '')
+        raise InputError(_first_line(error) + hint) from None
 
 
 def _is_secured() -> bool:
