@@ -163,6 +163,15 @@ def test_a_map_of_something_else_is_not_overwritten(folder, capfd):
     assert contents(folder / 'mine') == {Path('marker_map.yaml'): b'mine'}
 
 
+@pytest.mark.parametrize('name', ['marker_map.yaml', 'flight1/marker_map.yaml'])
+def test_a_batch_does_not_delete_the_map_that_it_starts_from(folder, alone, capfd, name):
+    """Begun from its own result it deleted that and its summary first, and then could not read it."""
+    before = contents(alone)
+    assert batch(folder, 'alone', '--map', alone / name) == 2
+    assert f'{name}: this batch would replace it' in capfd.readouterr().err
+    assert contents(alone) == before
+
+
 def test_all_arguments_that_are_no_bags_are_named_before_any_is_replayed(folder, capfd):
     """A folder without a bag, another file, and a bag without an IMU: as by a pattern that matches too much."""
     (folder / 'empty').mkdir()

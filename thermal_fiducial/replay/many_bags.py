@@ -84,8 +84,16 @@ class Batch:
             refuse_other_folder(run.run)
         if (self.out / MAP_FILE).exists() and not (self.out / SUMMARY_FILE).exists():
             raise InputError(f'{self.out / MAP_FILE} is not of an earlier batch: choose another folder with --out')
+        self._refuse_replaced_map(runs)
         self._check_bags(runs)
         return _common_camera(runs, read_settings(self.options.params, {}))
+
+    def _refuse_replaced_map(self, runs: Sequence[Options]) -> None:
+        """Refuse to start from a map of an earlier batch that this one deletes before it reads it."""
+        given = self.options.map_file
+        replaced = [self.out.resolve() / MAP_FILE, *(run.run for run in runs)]
+        if given is not None and any(given.resolve().is_relative_to(path) for path in replaced):
+            raise InputError(f'{given}: this batch would replace it: copy it, or choose another folder with --out')
 
     @contextmanager
     def cleared_up(self) -> Iterator[None]:
