@@ -246,6 +246,8 @@ def _anchor(args: argparse.Namespace) -> int:
         _, distances = map_editing.anchor(marker_map, surveyed)
     for key, distance in distances.items():
         print(f'marker {key}: {1e3 * distance:.1f} mm from its surveyed place')
+    for key in sorted(surveyed.keys() - distances.keys()):
+        print(f'marker {key}: surveyed, but not in the map')
 
     def anchored(marker_map: MarkerMap) -> MarkerMap:
         moved, used = map_editing.anchor(marker_map, surveyed)

@@ -182,6 +182,15 @@ def test_merge_brings_two_maps_into_one_frame(path, poses, capsys):
     assert np.max(np.abs(difference(merged.markers[2].T_map_marker, poses[2]))) < 1e-7
 
 
+def test_anchor_names_surveyed_markers_that_the_map_lacks(path, poses, capsys):
+    """A wrong ID in the survey was passed over in silence."""
+    survey = path.parent / 'survey.csv'
+    places = {key: poses[key][:3, 3] for key in (0, 3, 5)} | {99: np.zeros(3)}
+    survey.write_text(''.join(f'{key},{",".join(map(str, place))}\n' for key, place in places.items()))
+    assert run('anchor', path, survey) == 0
+    assert 'marker 99: surveyed, but not in the map' in capsys.readouterr().out
+
+
 def test_anchor_moves_the_map_onto_a_survey(path, poses):
     T = transform(so3_exp([0.0, 0.0, 0.7]), [100.0, 50.0, 2.0])
     survey = path.with_name('survey.csv')
