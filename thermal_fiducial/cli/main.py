@@ -112,6 +112,8 @@ def _reported(error: BaseException) -> tuple[int, str] | None:
         return INTERRUPTED, 'interrupted'
     if isinstance(error, ModuleNotFoundError) and error.name and error.name.partition('.')[0] != 'thermal_fiducial':
         return 2, f'needs the Python package {error.name}: {INSTALL_HINT}'
+    if type(error).__name__ == 'RCLError' and os.environ.get('ROS_SECURITY_ENABLE') == 'true':
+        return 2, f'ROS_SECURITY_ENABLE is true: {str(error).splitlines()[0]}'
     if isinstance(error, OSError) and error.errno in _REFUSED:
         _discard_output()
         return 2, f'{shown(error.filename or "output")}: {error.strerror}'

@@ -221,6 +221,25 @@ def test_a_command_needs_no_log_file():
     assert (done.returncode, done.stderr) == (1, '')
 
 
+def secured(tmp_path, keystore, module, *arguments):
+    """Exit status, and last line of the errors, of a program whose keystore has an enclave without keys."""
+    (tmp_path / 'keys' / 'enclaves' / 'empty').mkdir(parents=True)
+    environment = {
+        'ROS_SECURITY_ENABLE': 'true',
+        'ROS_SECURITY_STRATEGY': 'Enforce',
+        'ROS_SECURITY_KEYSTORE': keystore and str(tmp_path / keystore),
+    }
+    done = subprocess.run(
+        [sys.executable, '-m', f'thermal_fiducial{module}', *arguments],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    return done.returncode, done.stderr.splitlines()[-1]
+
+
 @pytest.mark.parametrize(
     ('keystore', 'enclave', 'words'),
     [
@@ -231,19 +250,17 @@ def test_a_command_needs_no_log_file():
 )
 def test_a_node_refused_by_security_reports_it_and_is_not_restarted(tmp_path, keystore, enclave, words):
     """Without a keystore, without its enclave, and with one that has no keys (or a middleware without security)."""
-    (tmp_path / 'keys' / 'enclaves' / 'empty').mkdir(parents=True)
-    secured = {
-        'ROS_SECURITY_ENABLE': 'true',
-        'ROS_SECURITY_STRATEGY': 'Enforce',
-        'ROS_SECURITY_KEYSTORE': keystore and str(tmp_path / keystore),
-    }
-    command = [sys.executable, '-m', 'thermal_fiducial.nodes.landing_target', '--ros-args', '--enclave', enclave]
-    done = subprocess.run(
-        command, env={**os.environ, **secured}, capture_output=True, text=True, timeout=60, check=False
-    )
-    last = done.stderr.splitlines()[-1]
-    assert (done.returncode, last.partition(':')[0]) == (2, 'landing_target.py')
+    status, last = secured(tmp_path, keystore, '.nodes.landing_target', '--ros-args', '--enclave', enclave)
+    assert (status, last.partition(':')[0]) == (2, 'landing_target.py')
     assert words in last
+
+
+@pytest.mark.parametrize('command', [['watch', '--once'], ['check-bridge', '--seconds', '1']])
+def test_a_command_refused_by_security_reports_it(tmp_path, command):
+    """It ended with a traceback."""
+    status, last = secured(tmp_path, 'keys', '', *command, '--ros-args', '--enclave', '/empty')
+    assert status == 2
+    assert last.startswith(f'thermal-fiducial {command[0]}: ROS_SECURITY_ENABLE is true: error creating node')
 
 
 def test_arguments_that_ros_leaves_are_named():
