@@ -5,6 +5,7 @@ The text passes the checks of :mod:`thermal_fiducial.files.schema` first: no ali
 
 import os
 from pathlib import Path
+import re
 from typing import Any
 
 import yaml
@@ -13,6 +14,12 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import one_line, read_text
 from thermal_fiducial.files.schema import parse_yaml
 from thermal_fiducial.files.writing import write_text
+
+_Loader: Any = type('_Loader', (getattr(yaml, 'CSafeLoader', yaml.SafeLoader),), {})
+# PyYAML takes 1e-4 and 1.0e4 for texts, ROS for numbers.
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float', re.compile(r'[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$'), list('-+.0123456789')
+)
 
 
 def load_plain(path: str | Path) -> Any:
@@ -26,7 +33,7 @@ def load_plain(path: str | Path) -> Any:
     text = read_text(path)
     parse_yaml(str(path), text)
     try:
-        document = yaml.load(text, Loader=getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
+        document = yaml.load(text, Loader=_Loader)
     except (yaml.YAMLError, ValueError, OverflowError, TypeError) as error:
         raise InputError(f'{path}: not valid YAML: {one_line(error)}') from None
     _check_integers(str(path), document)

@@ -47,6 +47,17 @@ def test_an_unknown_name_is_refused_in_a_section_of_ours(tmp_path, section):
         read_settings(file, {})
 
 
+@pytest.mark.parametrize('number', ['1e-4', '1.0e-4', '.1e-3', '1E-04', '1.e-4', '0.0001'])
+def test_numbers_are_what_ros_takes_for_numbers(tmp_path, number):
+    """A replay refused 1e-4, with which the nodes fly: PyYAML takes it for a text."""
+    file = tmp_path / 'rig.yaml'
+    file.write_text(f'/**: {{ros__parameters: {{imu.gyroscope_noise_density: {number}}}}}')
+    assert read_settings(file, {}).pose_ekf.imu.gyroscope_noise_density == 1e-4
+    file.write_text(f'/**: {{ros__parameters: {{imu.gyroscope_noise_density: "{number}"}}}}')
+    with pytest.raises(InputError, match='is not a number'):
+        read_settings(file, {})
+
+
 def test_sections_of_other_nodes_are_not_checked(tmp_path):
     file = tmp_path / 'rig.yaml'
     theirs = {'/mavros': {'ros__parameters': {'fcu_url': 'udp://'}}}
