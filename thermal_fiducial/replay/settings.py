@@ -81,6 +81,7 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any], second_came
     warnings = _check_files(settings)
     if document and not any(_values_for(node, document, seconds) for node in NODES):
         warnings.append(f'{params}: nothing in it is for our nodes: it is for {", ".join(document)}')
+    warnings += [f'{params}: {doubt}' for doubt in _whole_numbers(document)]
     return replace(settings, warnings=tuple(warnings))
 
 
@@ -127,6 +128,19 @@ def _check_files(settings: Settings) -> list[str]:
         frame = other_frame(marker_map.frame_id, mapper.map_frame)
         return [f'{mapper.map_file}: {doubt}' for doubt in (other, frame) if doubt]
     return []
+
+
+def _whole_numbers(document: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
+    """Doubts about whole numbers that ROS, which starts the nodes of a robot, does not take for others."""
+    defaults = {name: default for kind in NODES.values() for name, _, default in parameters(kind)}
+    ours = (values for pattern, values in document.items() if pattern.rsplit('/', 1)[-1] in ('**', '*', *NODES))
+    for values in ours:
+        for name, value in values.items():
+            default = defaults.get(name)
+            due = default[0] if isinstance(default, tuple) and default else default
+            given = value if isinstance(value, list) else [value]
+            if isinstance(due, float) and any(type(number) is int for number in given):
+                yield f'parameter {name}: on a robot ROS refuses {value}: each number needs a point, as 1.0'
 
 
 def _document(path: Path) -> dict[str, dict[str, Any]]:
