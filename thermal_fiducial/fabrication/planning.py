@@ -220,7 +220,8 @@ def expect(
     bits : along a side of the marker
     """
     if not (size > 0.0 and distance > size and 0.0 <= tilt_deg < 85.0 and contrast > 0.0):
-        raise InputError(f'side {size:g} m, distance {distance:g} m, tilt {tilt_deg:g} deg cannot be planned')
+        given = f'side {size:g} m, distance {distance:g} m, tilt {tilt_deg:g} deg'
+        raise InputError(f'{given} cannot be planned: the distance must be more than the side, the tilt below 85 deg')
     side_px = camera.focal_px * size / distance
     rng = np.random.default_rng(seed)
     T = viewed_at(distance, np.radians(tilt_deg), rng.uniform(0.0, 2.0 * np.pi, _SAMPLES), camera)

@@ -195,7 +195,7 @@ def test_poses_have_a_noise_of_their_own():
 
 @pytest.mark.parametrize('changed', [{'distance': 0.1}, {'tilt_deg': 88.0}, {'contrast': 0.0}, {'size': -1.0}])
 def test_views_that_cannot_be(changed):
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match='the distance must be more than the side, the tilt below 85 deg'):
         expect(
             table(1.0, 0.02), CAMERA, **{'size': 0.3, 'distance': 3.0, 'tilt_deg': 30.0, 'contrast': 50.0, **changed}
         )
