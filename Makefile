@@ -43,7 +43,7 @@ help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
 
 $(READY): setup.py
-	@echo '== Setting up $(VENV) with $(PYTHON): about 500 MB of packages, once'
+	@echo '== Setting up $(VENV) with $(PYTHON), once: about 350 MB to download, 1.3 GB on the disk'
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)) and "Python 3.11 or 3.12 is needed: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip 'setuptools<80' wheel
