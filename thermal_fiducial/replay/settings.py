@@ -70,6 +70,9 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any], second_came
     """
     document = {} if params is None else _document(params)
     overrides = dict(overrides) | ({'second_camera': second_camera} if second_camera else {})
+    for kind in NODES.values():
+        # An option is not blamed on the file.
+        from_mapping(kind, overrides)
     named = (section.get('second_camera') for section in (*document.values(), overrides))
     seconds = {str(name) for name in named if name}
     with nullcontext() if params is None else naming(params):

@@ -78,6 +78,11 @@ def test_sections_of_other_nodes_are_not_checked(tmp_path):
     assert read_settings(file, {}).warnings == (f'{file}: nothing in it is for our nodes: it is for /mavros',)
 
 
+def test_an_option_is_not_blamed_on_the_file():
+    with pytest.raises(InputError, match=r"^parameter second_camera: '7' is not the name of a namespace"):
+        read_settings(FILE, {}, second_camera='7')
+
+
 def test_a_map_of_another_dictionary_is_warned_of(tmp_path):
     map_file, _ = side_files(tmp_path)
     map_file.write_text(map_file.read_text().replace('DICT_4X4_50', 'DICT_5X5_50'))
