@@ -4,11 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.packages import is_installed
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import evaluate, Evaluation
 from thermal_fiducial.report.run_folder import read_run, SUMMARY
+from thermal_fiducial.report.trajectory import Trajectory
 
 __all__ = ['Evaluation', 'evaluate_run', 'write_page']
 
@@ -53,11 +55,20 @@ def evaluate_run(
         and evaluation.fused_errors is not None
         and not len(evaluation.fused_errors)
     ):
-        raise InputError(f'{run.truth_path}: ground truth and run {run_dir} have no time in common')
+        spans = f'{_span(run.truth)}, the run is {_span(run.fused)}'
+        raise InputError(f'{run.truth_path}: ground truth and run {run_dir} have no time in common; it is {spans}')
     numbers = evaluation.numbers()
     text = json.dumps(run.summary | {'evaluation': numbers}, indent=2)
     write_text(Path(run_dir) / SUMMARY, text + '\n')
     return evaluation, numbers
+
+
+def _span(trajectory: Trajectory) -> str:
+    """When a trajectory begins and ends: another time base shows."""
+    if not len(trajectory):
+        return 'empty'
+    begin, end = (float(trajectory.stamps_ns[at]) / SECOND_NS for at in (0, -1))
+    return f'from {begin:.1f} to {end:.1f} s'
 
 
 def write_page(evaluation: Evaluation, numbers: dict[str, Any], bag: Path | None = None) -> Path:
