@@ -42,6 +42,8 @@ def add_align(parser: Parser) -> None:
 
 def _align(args: argparse.Namespace) -> int:
     require_unit('the orientation of --initial', args.initial[3:])
+    if args.out and args.out.resolve() in (args.map.resolve(), args.cloud.resolve()):
+        raise InputError(f'--out {args.out}: the transform would replace that file; the map is not changed by align')
     marker_map = load_map(args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
     if not marker_map.markers:
         raise InputError(f'{args.map}: the map has no marker')

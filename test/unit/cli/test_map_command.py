@@ -182,6 +182,18 @@ def test_merge_brings_two_maps_into_one_frame(path, poses, capsys):
     assert np.max(np.abs(difference(merged.markers[2].T_map_marker, poses[2]))) < 1e-7
 
 
+@pytest.mark.parametrize('name', ['map.yaml', 'cloud.ply', 'here/map.yaml'])
+def test_align_does_not_replace_its_inputs(path, capsys, name):
+    """The transform took the place of the map, which has no history of that."""
+    cloud = path.with_name('cloud.ply')
+    write_ply(cloud, np.random.default_rng(0).uniform(-1.0, 1.0, (1000, 3)))
+    (path.parent / 'here').symlink_to('.')
+    before = path.read_bytes(), cloud.read_bytes()
+    assert run('align', path, '--cloud', cloud, '--out', path.parent / name) == 2
+    assert 'the transform would replace that file' in capsys.readouterr().err
+    assert (path.read_bytes(), cloud.read_bytes()) == before
+
+
 def test_anchor_names_surveyed_markers_that_the_map_lacks(path, poses, capsys):
     """A wrong ID in the survey was passed over in silence."""
     survey = path.parent / 'survey.csv'
