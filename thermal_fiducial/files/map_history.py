@@ -183,9 +183,11 @@ def undo(path: Path) -> MapVersion:
         There is none, or the file can't be written.
     """
     with locked(path):
-        earlier = [entry for entry in entries(path) if not entry.problem]
+        kept = entries(path)
+        earlier = [entry for entry in kept if not entry.problem]
         if not earlier:
-            raise InputError(f'{path}: no earlier version is kept')
+            unreadable = f' that can be read: {kept[-1].problem}' if kept else ''
+            raise InputError(f'{path}: no earlier version is kept{unreadable}')
         last = earlier[-1]
         text = read_text(last.path)
         with into(path):

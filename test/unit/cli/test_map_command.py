@@ -138,6 +138,11 @@ def test_maps_of_markers_without_sides_are_upgraded_and_have_a_history(tmp_path,
     printed = capsys.readouterr().out
     assert f'{path}: upgraded; revision 12' in printed
     assert 'now  revision 12, 1 marker' in printed
+    # "No earlier version is kept", where the history lists one, is no answer.
+    assert run('undo', path) == 2
+    error = capsys.readouterr().err
+    assert 'no earlier version is kept that can be read' in error
+    assert 'schema 12 is unknown' in error
 
 
 @pytest.mark.parametrize(
