@@ -87,7 +87,7 @@ def _line(finding: Finding) -> str:
 def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> 'tuple[BridgeRecord, Links]':
     try:
         from thermal_fiducial.ros.watching.bridge_listener import listen, Topics
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise InputError(f'listening needs ROS 2 ({error.name} is missing); name a recording instead') from None
     recorder = BridgeRecorder(live=True)
 

@@ -87,7 +87,7 @@ def _compare(args: argparse.Namespace) -> int:
     page = args.out or COMPARISON
     try:
         from thermal_fiducial.report.comparison import compare
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise InputError(f'--compare needs {error.name}: install the extra "tools"') from None
     comparison = compare(args.folders, args.truth)
     if args.json:
@@ -113,7 +113,7 @@ def print_tables(shown: Iterable[Table]) -> None:
     """
     try:
         from thermal_fiducial.cli.terminal_tables import show
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise InputError(f'the tables need {error.name}: install the extra "tools", or use --json') from None
     for entry in shown:
         for part in _parts(entry):

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Show the state until interrupted."""
     try:
         from thermal_fiducial.ros.watching.watcher import watch
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise InputError(f'watching needs ROS 2 ({error.name} is missing)') from None
     if args.once:
         last: list[LiveState] = []

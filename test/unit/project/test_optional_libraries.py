@@ -63,6 +63,16 @@ def test_a_missing_tool_is_named_in_one_line(run_folder, options):
     assert result.stderr.count('\n') == 1
 
 
+def test_a_package_that_is_there_and_broken_is_not_said_to_be_missing(run_folder, tmp_path):
+    """Ubuntu's own are, beside NumPy 2 of pip: '--compare needs None' hid it."""
+    (tmp_path / 'evo').mkdir()
+    (tmp_path / 'evo' / '__init__.py').write_text("raise ImportError('numpy.core.multiarray failed to import')")
+    code = f'import sys; sys.path.insert(0, {str(tmp_path)!r}); {COMMAND}'
+    result = python(code, (), 'evaluate', run_folder, str(tmp_path), '--compare')
+    assert result.stderr.endswith('ImportError: numpy.core.multiarray failed to import\n')
+    assert 'needs' not in result.stderr
+
+
 @pytest.mark.parametrize(
     ('options', 'hidden', 'words'),
     [
