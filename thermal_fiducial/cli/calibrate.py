@@ -104,7 +104,7 @@ def _camera_imu(args: argparse.Namespace) -> int:
     with BagReader(args.bag, parse_remaps(args.remap)) as bag:
         camera = _camera_of(bag, args.calibration)
         imu, start_ns = imu_track(bag)
-        detector = mapped_detector(marker_map, args.plate_thickness)
+        detector = mapped_detector(marker_map, args.map.parent, args.plate_thickness)
         if args.plate_thickness and _has_corners_only(bag):
             raise InputError(f'--plate-thickness has no effect with {args.bag}, which has corners instead of images')
         found = _recorded_rows(bag) if _has_corners_only(bag) else _detected_rows(bag, detector, camera)

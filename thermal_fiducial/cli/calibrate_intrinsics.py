@@ -32,7 +32,7 @@ from thermal_fiducial.core.measurements import places_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import save_camera
-from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.dictionary import dictionary_of_map, load_dictionary
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.plain_yaml import save_plain
 from thermal_fiducial.files.reading import naming
@@ -200,7 +200,7 @@ def _target(args: argparse.Namespace) -> Target:
         raise InputError('--target markers needs --board, the marker map of the board')
     board = load_map(args.board)
     with naming(args.board):
-        return MarkerBoard(board, mapped_detector(board, args.plate_thickness))
+        return MarkerBoard(board, mapped_detector(board, args.board.parent, args.plate_thickness))
 
 
 def _place(text: str) -> tuple[int, int]:
@@ -211,10 +211,11 @@ def _place(text: str) -> tuple[int, int]:
     return column, row
 
 
-def mapped_detector(board: MarkerMap, thickness: float = 0.0) -> MarkerDetector:
-    """Detector with the markers of ``board``, plates of ``thickness`` [m], as its map."""
-    config = ArucoDetectorConfig(dictionary=board.dictionary, plate_thickness=thickness)
-    detector = MarkerDetector(config, load_dictionary(board.dictionary))
+def mapped_detector(board: MarkerMap, folder: Path, thickness: float = 0.0) -> MarkerDetector:
+    """Detector with the markers of ``board``, a map in ``folder``, plates of ``thickness`` [m], as its map."""
+    dictionary = dictionary_of_map(board.dictionary, folder)
+    config = ArucoDetectorConfig(dictionary=dictionary, plate_thickness=thickness)
+    detector = MarkerDetector(config, load_dictionary(dictionary))
     detector.set_map(*places_of(board.rows()))
     return detector
 

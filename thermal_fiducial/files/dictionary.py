@@ -89,6 +89,11 @@ def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path =
     return f'{differ}, whose marker {other[0]} looks different' if other else ''
 
 
+def is_own_file(name: str) -> bool:
+    """Whether :func:`load_dictionary` takes a name for the path of a file, not for a dictionary that it knows."""
+    return name not in _predefined() and name not in packaged()
+
+
 def not_in_dictionary(markers: Iterable[int], name: str, folder: Path) -> list[int]:
     """IDs ``markers`` that the dictionary of a map in ``folder`` lacks.
 

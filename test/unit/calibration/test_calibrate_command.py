@@ -35,6 +35,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera, save_camera
+from thermal_fiducial.files.dictionary import load_dictionary, PACKAGED
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.ros.messages.clouds import MARKER_CLOUDS
@@ -93,7 +94,7 @@ def test_one_pose_far_off_does_not_make_the_error_that_is_printed(tmp_path, caps
 
 def with_corners_instead_of_images(images, marker_map):
     """A recording in which detections stand for the images, as in those of ``import``."""
-    detector, corners = mapped_detector(load_map(marker_map)), images.without(IMAGE_TOPIC)
+    detector, corners = mapped_detector(load_map(marker_map), marker_map.parent), images.without(IMAGE_TOPIC)
     for message in images.of(IMAGE_TOPIC):
         stamp_ns = stamp_to_ns(message.header.stamp)
         rows = detector.detect(stamp_ns, image_to_array(message), CAMERA)
@@ -203,7 +204,7 @@ def test_a_board_of_plates_has_their_thickness(tmp_path, monkeypatch):
     """Taken for printed ones, a dozen plates of 130 x 130 x 3 mm made the focal length 0.6 % too long."""
     given = []
 
-    def noted(board, thickness=0.0):
+    def noted(board, folder, thickness=0.0):
         given.append(thickness)
         raise InputError('enough')
 
@@ -212,6 +213,23 @@ def test_a_board_of_plates_has_their_thickness(tmp_path, monkeypatch):
     words = ['calibrate', 'intrinsics', str(tmp_path), '--target', 'markers', '--board', str(marker_map)]
     assert main([*words, '--plate-thickness', '0.003', '--out', str(tmp_path / 'lens.yaml')]) == 2
     assert given == [0.003]
+
+
+def test_a_board_has_its_dictionary_file_beside_it(tmp_path, monkeypatch):
+    """Calibration looked for it where it was started; the board, as any map, names it from its own folder."""
+    own = PACKAGED / 'STENCIL_4X4_16.yaml'
+    (tmp_path / 'mine.yaml').write_text(own.read_text())
+    monkeypatch.chdir(tmp_path)
+    words = ['markers', 'board', 'markers', '--dictionary', 'mine.yaml', '--grid', '2', '1', '--formats', 'svg']
+    assert main([*words, '--out', 'board']) == 0
+    assert main(['map', 'check', 'board/board.yaml']) == 0
+    (tmp_path / 'mine.yaml').unlink()
+    board = load_map(tmp_path / 'board' / 'board.yaml')
+    assert np.array_equal(load_dictionary(tmp_path / 'board' / 'mine.yaml').bits, load_dictionary(own).bits)
+    assert mapped_detector(board, tmp_path / 'board') is not None
+    # A map from elsewhere opens nothing but its neighbours.
+    with pytest.raises(InputError, match='neither a name nor a file beside the map'):
+        mapped_detector(replace(board, dictionary='/etc/passwd'), tmp_path)
 
 
 def test_unreadable_pictures_and_those_of_another_size_are_named(tmp_path, capsys):
