@@ -2,6 +2,7 @@
 
 import argparse
 from collections import Counter
+from shlex import quote
 
 from thermal_fiducial.cli import marker_drawings, marker_planning
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
@@ -144,7 +145,7 @@ def _dictionary(args: argparse.Namespace) -> int:
     kept = bits[: args.count]
     count = ('' if args.count is None else f' --count {args.count}') + ' --signed' * args.signed
     command = f'--bits {args.bits} --distance {args.distance} --seed {args.seed} --restarts {args.restarts}{count}'
-    made_by = f'thermal-fiducial markers dictionary {args.out.name} {command}'
+    made_by = f'thermal-fiducial markers dictionary {quote(args.out.name)} {command}'
     save_dictionary(args.out, args.out.stem, Dictionary(kept, (args.distance - 1) // 2), made_by)
     between, own = distances(kept)
     print(f'{args.out}: {len(kept)} of {number_of(found, "marker")}, distance {between}, to own rotations {own}')

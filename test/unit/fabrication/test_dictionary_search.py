@@ -1,6 +1,7 @@
 from itertools import combinations
 from pathlib import Path
 import re
+import shlex
 import tracemalloc
 
 import numpy as np
@@ -138,6 +139,13 @@ def test_packaged_dictionaries_are_reproduced_by_their_commands(name, tmp_path):
     assert main(['markers', 'dictionary', str(out), *arguments]) == 0
     assert out.read_text() == packaged
     assert len(dictionary.bits) == len(load_dictionary(out).bits)
+
+
+def test_the_command_in_a_dictionary_is_one_of_a_shell(tmp_path):
+    out = tmp_path / 'my own.yaml'
+    assert main(['markers', 'dictionary', str(out), '--distance', '6', '--restarts', '5']) == 0
+    command = shlex.split(out.read_text().splitlines()[0].removeprefix('# '))
+    assert command[:4] == ['thermal-fiducial', 'markers', 'dictionary', 'my own.yaml']
 
 
 def test_opencv_reads_the_packaged_markers():
