@@ -8,6 +8,7 @@ from support import small_bag
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMU_TOPIC, MAP_ERROR_TOPIC
+from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary
 
 pytestmark = pytest.mark.ros
 
@@ -111,3 +112,16 @@ def test_what_is_missing_is_named(folder, tmp_path, capfd):
 
 def test_a_bag_of_images_is_replayed_from_any_entry_that_it_has(folder):
     assert replay(folder, 'markers', '--from', 'images') == 2
+
+
+def test_a_map_with_a_dictionary_of_its_own_is_read_in_the_run_folder(folder, capfd):
+    """The run had a copy of the map without its dictionary file: the nodes and ``map check`` doubted it."""
+    save_dictionary(folder / 'own.yaml', 'own', load_dictionary('DICT_4X4_50'))
+    own = folder / 'own_map.yaml'
+    own.write_text((folder / 'map.yaml').read_text().replace('DICT_4X4_50', 'own.yaml'))
+    assert replay(folder, 'markers', '--map', own) == 0
+    run = folder / 'markers_run'
+    assert (run / 'own.yaml').read_text() == (folder / 'own.yaml').read_text()
+    assert 'dictionary' not in capfd.readouterr().err
+    assert main(['map', 'check', str(run / 'marker_map.yaml')]) == 0
+    assert 'own.yaml' not in capfd.readouterr().err

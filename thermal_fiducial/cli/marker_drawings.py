@@ -26,7 +26,7 @@ from thermal_fiducial.fabrication.sheet import nest
 from thermal_fiducial.fabrication.strength import strength_of
 from thermal_fiducial.fabrication.verification import agree, problems, read_dxf
 from thermal_fiducial.fabrication.writers import FORMATS, write
-from thermal_fiducial.files.dictionary import is_own_file, load_dictionary
+from thermal_fiducial.files.dictionary import copied_beside, load_dictionary
 from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.files.packages import is_installed
 from thermal_fiducial.files.reading import read_text
@@ -127,14 +127,12 @@ def _board(args: argparse.Namespace) -> int:
     base = base_plate(centres, labels, bits.shape[1] + 2, options)
     board = args.out / 'board.yaml'
     markers = [marker_drawing(bits[int(label)], label, options) for label in labels]
-    # A map finds a dictionary file beside itself alone.
-    own, beside = Path(args.dictionary), args.out / Path(args.dictionary).name
-    copied = is_own_file(args.dictionary) and own.resolve() != beside.resolve()
-    _write_all([*markers, base], args, [board, *[beside] * copied])
+    copy = copied_beside(args.dictionary, args.out)
+    _write_all([*markers, base], args, [board, *filter(None, [copy])])
     _say_what_is_weak(markers, args, bits.shape[1] + 2)
-    if copied:
-        write_text(beside, read_text(own))
-    save_map(board, _board_map(centres, options, own.name))
+    if copy is not None:
+        write_text(copy, read_text(args.dictionary))
+    save_map(board, _board_map(centres, options, Path(args.dictionary).name))
     _say_how_to_use(f'markers --board {quote(str(board))} --plate-thickness {args.thickness / 1e3:g}')
     return 0
 

@@ -121,6 +121,12 @@ def dictionary_of_map(name: str, folder: Path) -> str:
     return str(folder / name)
 
 
+def copied_beside(name: str, folder: Path) -> Path | None:
+    """Where in ``folder`` a map finds a copy of its dictionary file; None for a known name, or if it is that file."""
+    copy = folder / Path(name).name
+    return copy if is_own_file(name) and copy.resolve() != Path(name).resolve() else None
+
+
 def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: Dictionary, comment: str = '') -> None:
     """Write ``dictionary`` as a dictionary file below a ``comment``. Raises InputError if it cannot be written."""
     document = {
