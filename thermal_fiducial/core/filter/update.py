@@ -222,8 +222,8 @@ def _with_markers(estimate: Estimate, pose: BodyPose) -> Estimate:
     estimate = replace(estimate, covariance=P)
     of_map, of_change, own = now.moved_by(noise.of_map), now.moved_by(apart), P[POSITION, POSITION].trace()
     # In a map of its own the estimate would know its place by the markers and by itself, in theirs by them alone.
-    lost = of_change - of_change * own / (of_change + own)
-    if now.moved_by(now.map_covariance) > of_map and lost > _LITTLE * of_map:
+    cost = of_change - of_change * own / (of_change + own)
+    if now.moved_by(now.map_covariance) > of_map and cost > _LITTLE * of_map:
         return estimate
     if now.moved_by(P[MARKERS, MARKERS]) > now.moved_by(apart):
         # The random walk knows less than the two covariances: the markers in between were worse.
