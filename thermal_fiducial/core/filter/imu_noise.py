@@ -219,7 +219,8 @@ class NoiseFloor:
         # Power of second differences to squared density of the samples.
         gain = 4.0 * np.sin(np.pi * frequencies * seconds) ** 2
         scale = seconds / (np.maximum(gain, TINY) ** 2 * (self._window**2).sum())
-        self._windows = 0
+        # Slow samples have fewer bands: those of another rate are not their mean.
+        self._windows, self._power = 0, np.zeros((len(inside), 2))
         self._bands = inside / inside.sum(axis=1, keepdims=True) * scale
 
     def _measure(self) -> None:

@@ -43,7 +43,7 @@ def test_the_floor_of_the_noise_is_found_under_motion_and_between_tones(rate):
     assert noise == pytest.approx((1.0e-3, 2.0e-2), rel=0.3)
 
 
-@pytest.mark.parametrize('rates', [(50.0, 200.0), (200.0, 50.0), (400.0, 100.0)])
+@pytest.mark.parametrize('rates', [(50.0, 200.0), (200.0, 50.0), (400.0, 100.0), (200.0, 45.0)])
 def test_the_floor_is_found_after_a_change_of_the_rate(rates):
     """An autopilot is asked for another rate once it streams."""
     monitor = ImuNoiseMonitor(LINEAR)
