@@ -59,3 +59,15 @@ def test_an_initialisation_is_the_same_when_its_first_pose_comes_last():
     apart = late.state.position - in_turn.state.position
     # The samples after a pose that have arrived by then are other ones: a tenth of what it was, 1.9 mm.
     assert np.abs(apart).max() < 2e-4
+
+
+def test_late_poses_after_a_pause_of_the_start_are_compared_with_their_own_instants():
+    """Two poses, none for 2.5 s, in which old samples are forgotten, and further ones: at once, and 0.3 s late."""
+    flight = Flight(seed=4, seconds=4.0)
+    poses = flight.poses[:2] + [pose for pose in flight.poses if pose.stamp_ns > flight.poses[0].stamp_ns + 2.55e9]
+    at_once, late = PoseEkf(config()), PoseEkf(config())
+    run(at_once, timeline(flight.samples(), poses))
+    run(late, timeline(flight.samples(), poses, 0.3))
+    apart = late.state.position - at_once.state.position
+    # Samples after a pose that have arrived by then: 0.4 mm. Compared with the end of the pause, 850 mm.
+    assert np.abs(apart).max() < 2e-3
