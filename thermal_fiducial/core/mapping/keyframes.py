@@ -147,7 +147,10 @@ class KeyframeStore:
         self._gap: CameraPose | None = None
 
     def add(self, frame: Keyframe) -> None:
-        """Keep ``frame``; thin out when there are too many."""
+        """Keep ``frame``, the first one of its stamp; thin out when there are too many."""
+        if frame.stamp_ns in self.frames:
+            # The clock was set back. An adjustment under way has the pose of the first one.
+            return
         self.frames[frame.stamp_ns] = frame
         self._added += 1
         if len(self.frames) > self._budget:

@@ -70,6 +70,15 @@ def test_frames_that_were_not_adjusted_move_with_the_nearest():
     np.testing.assert_array_equal(store.move({99: early}).at(3), np.eye(4))
 
 
+def test_a_frame_of_a_repeated_stamp_does_not_move_the_map():
+    """A simulation begins once more while an adjustment is under way: the robot has moved, the map has not."""
+    store = KeyframeStore(10, MarkerMap())
+    store.add(frame(0, np.eye(4)))
+    store.add(frame(0, transform(np.eye(3), [1.0, 0.0, 0.0])))
+    shift = transform(np.eye(3), [0.0, 0.001, 0.0])
+    np.testing.assert_allclose(store.move({0: shift}).at(0), shift, atol=1e-12)
+
+
 def test_rotations_stay_rotations_however_often_the_map_moves():
     """Rounding errors must not double from one adjustment to the next: in half an hour there are hundreds."""
     rng = np.random.default_rng(0)
