@@ -79,12 +79,15 @@ class JointFit:
             except np.linalg.LinAlgError:
                 return None
             step = gains @ reprojection.residuals.ravel()
-            if remaining == 0 or step @ information @ step < _SMALL_STEP:
+            if step @ information @ step < _SMALL_STEP:
                 break
-            T_map_camera = retract(T_map_camera, step)
-            reprojection = self.sight.reprojected(self.camera, T_map_camera)
-            if not np.all(np.isfinite(reprojection.residuals)):
+            moved = retract(T_map_camera, step)
+            there = self.sight.reprojected(self.camera, moved)
+            # Markers that contradict each other may drive the last step, too, to where the camera shows none of them.
+            if not np.all(np.isfinite(there.residuals)):
                 return None
+            if remaining > 0:
+                T_map_camera, reprojection = moved, there
         after = replace(reprojection, residuals=reprojection.residuals - (J @ step).reshape(n, 4, 2))
         return self._location(T_map_camera, step, gains, chi2, after, weights)
 
@@ -156,7 +159,7 @@ class JointFit:
     def likeliest(self, start: FloatArray, prior: CameraPose, weights: FloatArray) -> tuple[float, FloatArray] | None:
         """The likeliest camera (4, 4) by corners and ``prior``, from a ``start`` (4, 4), and its cost, chi square.
 
-        None if a marker gets behind the camera.
+        None if a marker gets behind the camera, or endlessly far away.
         """
         T, expected, information_there = start, prior.T_map_camera, np.linalg.inv(prior.covariance)
         for _ in range(_MOST_STEPS + 1):
@@ -168,7 +171,10 @@ class JointFit:
             there = lever_arm(expected[:3, 3] - T[:3, 3])
             of_prior = there.T @ information_there
             information = J.T @ weighted + of_prior @ there
-            step = np.linalg.solve(information, weighted.T @ reprojection.residuals.ravel() - of_prior @ apart)
+            try:
+                step = np.linalg.solve(information, weighted.T @ reprojection.residuals.ravel() - of_prior @ apart)
+            except np.linalg.LinAlgError:
+                return None
             if step @ information @ step < _SMALL_STEP:
                 break
             T = screwed(T, np.asarray(step))
@@ -178,9 +184,11 @@ class JointFit:
         """What the corners say of a camera that is near (4, 4), linearised there.
 
         Nothing of displacements that they would show worse than ``VAGUE``: the claim is ``NOTHING_KNOWN`` there. None
-        if a covariance is not finite.
+        if a marker is behind the camera, or a covariance is not finite.
         """
         reprojection = self.sight.reprojected(self.camera, T_map_camera)
+        if not np.all(np.isfinite(reprojection.residuals)):
+            return None
         J = reprojection.J_camera.reshape(-1, 6)
         weighted, chi2 = self._weighted(reprojection, weights)
         # A shift counts as the turn by which it moves the markers in the image.

@@ -7,6 +7,7 @@ import pytest
 from support.walls import CAMERA, flight, look, see, SIZE, wall
 
 from thermal_fiducial.core.error_model import SystematicErrors
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit
 from thermal_fiducial.core.geometry.reprojection import difference, retract, screw_difference, screwed, turned
 from thermal_fiducial.core.geometry.se3 import rotation_angle, so3_exp, transform
@@ -269,6 +270,42 @@ def test_the_likeliest_camera_is_a_minimum_of_corners_and_odometry():
     assert least == pytest.approx(cost(at), rel=1e-6)
     # The last step would lower it by less than 0.01.
     assert all(cost(screwed(at, step)) > least - 0.01 for step in 0.003 * rng.normal(size=(50, 6)))
+
+
+def test_no_camera_is_likeliest_endlessly_far_away():
+    """The equations are singular there."""
+    rng = np.random.default_rng(0)
+    poses, T = look_at_one(rng, [-3.0, 0.2, 0.0])
+    frame, start = joint_fit_of(poses, see(T, poses, 0.3, rng)), look([-1e9, 2e8, 0.0], poses[0][:3, 3])
+    assert frame.likeliest(start, known_to(T, 3.0, 1.0), np.ones(1)) is None
+
+
+def test_a_fit_that_diverges_is_none():
+    """To two markers of which one was moved by metres, from a wrong start: the last step ends behind a marker."""
+    rng = np.random.default_rng(822)
+    poses = {key: T_map_marker for key, T_map_marker in wall(rng).items() if key in (1, 2)}
+    rows = see(flight(0.0), poses, 0.1, rng)
+    poses[2] = retract(poses[2], rng.normal(size=6) * np.repeat((1.5, 1.0), 3))
+    frame, T = joint_fit_of(poses, rows), retract(flight(0.0), rng.normal(size=6) * np.repeat((1.0, 0.4), 3))
+    assert frame.refined(T, frame.sight.reprojected(CAMERA, T), np.ones(2)) is None
+
+
+def test_markers_that_contradict_each_other_and_odometry_give_a_finite_pose():
+    """Two that were moved, before a wide lens: the likeliest camera has one of them behind it."""
+    rng = np.random.default_rng(5326)
+    wide = Camera(640, 512, np.array([[170.0, 0.0, 319.5], [0.0, 170.0, 255.5], [0.0, 0.0, 1.0]]), 'equidistant')
+    poses = {key: T_map_marker for key, T_map_marker in wall(rng).items() if key in (1, 2)}
+    centre = np.mean([T_map_marker[:3, 3] for T_map_marker in poses.values()], axis=0)
+    T = look(centre + rng.uniform(0.5, 4.0) * np.array([-1.0, *rng.uniform(-0.7, 0.7, 2)]), centre)
+    rows = see(T, poses, 0.5, rng, camera=wide)
+    moved = {key: retract(at, rng.normal(size=6) * np.repeat((1.0, 0.5), 3)) for key, at in poses.items()}
+    covariance = 1e-6 * np.eye(6)
+    markers = {key: MapMarker(key, SIZE, False, at, covariance, observations=key - 1) for key, at in moved.items()}
+    sight = Sight.of(Observations.of(rows), MarkerMap(markers).with_assumed_draws(MODEL))
+    odometry = known_to(retract(T, 0.05 * rng.normal(size=6)), 0.05, 0.05)
+    pose = locate(0, sight, wide, MODEL, odometry).pose
+    assert np.isfinite(pose.T_map_camera).all()
+    assert np.isfinite(pose.covariance).all()
 
 
 def test_what_corners_measure_is_linear_in_them():
