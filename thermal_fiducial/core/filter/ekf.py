@@ -214,10 +214,10 @@ class PoseEkf:
 
     def _fits(self, pose: CameraPose) -> bool:
         """Whether a pose can be used instead of those that suggest a step, and passes the gate of an unknown clock."""
-        innovation = self._history.compared(pose)
-        if innovation is None or self._unusable(pose, self._camera_clock.suspects):
+        if self._unusable(pose, self._camera_clock.suspects):
             return False
-        return passes_with_unknown_clock(self._config, innovation)
+        innovation = self._history.compared(pose)
+        return innovation is not None and passes_with_unknown_clock(self._config, innovation)
 
     # --- output ---------------------------------------------------------------------------------------
 

@@ -103,6 +103,21 @@ def test_a_step_is_followed_where_delays_scatter_by_more_than_frames(step):
     assert ekf.resets == 0
 
 
+def test_an_unusable_pose_does_not_decide_on_a_step():
+    """The fifth behind it, with which the first four would agree."""
+    flight, ekf = Flight(seed=3, seconds=FOLLOWED), PoseEkf(config())
+    since = [pose.stamp_ns - START_NS for pose in flight.poses if pose.stamp_ns - START_NS >= AT * 1e9]
+    for item in stepping(flight, 0.3):
+        if isinstance(item, ImuSample):
+            ekf.add_imu(item)
+        elif item.stamp_ns - START_NS == since[4] + 300_000_000:
+            assert 'finite' in ekf.add_pose(replace(item, T_map_camera=np.full((4, 4), np.nan))).reason
+        else:
+            ekf.add_pose(item)
+    # The next one does; the offset is as good as without it.
+    assert ekf.diagnostics()['time offset'] == pytest.approx(-0.3, abs=0.01)
+
+
 @pytest.mark.parametrize('late', [0.15, 1.5])
 def test_late_poses_are_no_step(late):
     ekf, states, _, flight = flown(late=late)
