@@ -324,4 +324,4 @@ class PoseEkf:
             'time offset': self._clock_offset(main),
             'time offset std': self._time_offset_std(main),
         }
-        return numbers | of_filter | figures_of(self._history, main, state, self._config.gravity)
+        return numbers | of_filter | figures_of(self._history, main, state)

@@ -160,10 +160,10 @@ def _without_estimate(belief: Belief, config: PoseEkfConfig) -> Condition:
     return Condition('initialising', f'{begun.hits} of {config.initial_poses} poses') if begun else WAITING
 
 
-def figures_of(history: History, main: Hypothesis, state: NavigationState, gravity: float) -> dict[str, float]:
+def figures_of(history: History, main: Hypothesis, state: NavigationState) -> dict[str, float]:
     """Figures of the estimate ``main`` for the diagnostics (SI units).
 
-    ``state``: that of ``main``, in the present map; ``gravity``: its size.
+    ``state``: that of ``main``, in the present map.
     """
     white, jitter, vibration = main.estimate.pose_noise.stds
     return {
@@ -176,5 +176,5 @@ def figures_of(history: History, main: Hypothesis, state: NavigationState, gravi
         'accelerometer bias': float(np.linalg.norm(state.bias[3:])),
         'gyroscope scale error': float(np.abs(state.scale[0]).max()),
         'accelerometer scale error': float(np.abs(state.scale[1]).max()),
-        'map tilt': math.asin(float(np.hypot(*state.gravity[:2])) / gravity),
+        'map tilt': math.atan2(np.hypot(*state.gravity[:2]), -state.gravity[2]),
     }

@@ -1,5 +1,6 @@
 """A correction of the map moves the estimate with it: nothing else changes."""
 
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 
@@ -152,3 +153,17 @@ def test_without_a_correction_the_jump_is_refused_at_first():
             accepted.append((late, update.accepted))
     assert not next(was_accepted for late, was_accepted in accepted if late)
     assert [was_accepted for late, was_accepted in accepted if not late][-1]
+
+
+@pytest.mark.parametrize('tilt', [0.5, 1.0])
+def test_the_tilt_of_a_map_is_known_at_any_angle(tilt):
+    """In half turns: one on its side, and one upside down. Rounding may make the vertical longer than gravity."""
+    ekf = PoseEkf(config(map_tilt_std=0.0))
+    for kind, item in events(Flight(seconds=1.0)):
+        ekf.add_pose(item) if kind else ekf.add_imu(item)
+    for yaw in np.linspace(0.0, 2.0 * np.pi, 40):
+        step = transform(so3_exp([0.0, 0.0, yaw]) @ so3_exp([tilt * np.pi, 0.0, 0.0]), np.zeros(3))
+        moved = deepcopy(ekf)
+        moved.move_map(step)
+        # Rounding of a rotation, a thousand times.
+        assert moved.diagnostics()['map tilt'] == pytest.approx(tilt * np.pi, abs=1e-12)
