@@ -7,6 +7,7 @@ about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that t
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from operator import index
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -188,8 +189,12 @@ _POSE_SHAPES = {'T_map_camera': (4, 4), 'covariance': (6, 6), 'map_covariance': 
 
 def _check(record: 'ImuSample | CameraPose', shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Raise InputError if arrays of a ``record`` have other ``shapes``, or its stamp is not in whole nanoseconds."""
-    if not isinstance(record.stamp_ns, (int, np.integer)):
-        raise InputError(f'{type(record).__name__}: stamp_ns {record.stamp_ns!r} is not an integer of nanoseconds')
+    try:
+        # Differences of numpy's unsigned integers would never be negative.
+        object.__setattr__(record, 'stamp_ns', index(record.stamp_ns))
+    except TypeError:
+        words = f'{type(record).__name__}: stamp_ns {record.stamp_ns!r} is not an integer of nanoseconds'
+        raise InputError(words) from None
     for name, shape in shapes.items():
         if getattr(getattr(record, name), 'shape', None) != shape:
             found = f'is a {type(value := getattr(record, name)).__name__} of shape {np.shape(value)}'

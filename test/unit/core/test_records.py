@@ -89,6 +89,14 @@ def test_a_record_of_other_shapes_or_units_of_time_is_refused(kind, values, word
         kind(*values)
 
 
+@pytest.mark.parametrize('integer', [int, np.int64, np.uint64])
+def test_stamps_may_be_any_integers_of_numpy(integer):
+    """Differences of unsigned ones are never negative: all poses were far ahead of the IMU."""
+    pose = CameraPose(integer(5_000_000_000), np.eye(4), np.eye(6))
+    assert pose.stamp_ns - 7_000_000_000 == -2_000_000_000
+    assert ImuSample(integer(5), np.zeros(3), np.zeros(3)).stamp_ns + -7 == -2
+
+
 @pytest.mark.parametrize('markers', [[], np.zeros((4, 2)), np.zeros(2, MARKER_DTYPE).tolist()])
 def test_what_is_no_row_of_markers_is_refused(markers):
     with pytest.raises(InputError, match='no rows of MARKER_DTYPE'):
