@@ -7,10 +7,12 @@ import pytest
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.camera_frames import pixel_noise
 from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.detection.finding.finder import near_prediction
 from thermal_fiducial.core.detection.finding.search import BlindSearch, overlapped, SearchScales
 from thermal_fiducial.core.detection.patterns import Decoder, Dictionary, Reading, sampled, shrunk
 from thermal_fiducial.core.detection.prediction.frame import Frame, Places
-from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
+from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers, FoundMarkers
+from thermal_fiducial.core.detection.prediction.twist import UNKNOWN_TWIST
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.files.dictionary import load_dictionary
 
@@ -254,3 +256,47 @@ def test_no_markers_in_noise():
     for frame in range(12):
         noise = rng.normal(0, (1.0, 3.0, 30.0)[frame % 3], (512, 640))
         assert search((7000 + noise).astype(np.float32)).ids.tolist() == []
+
+
+#: Largest error of an outline from which sides are found [px]: four passes of two blurs of 0.66 px each.
+FOUND_FROM_PX = 5.0
+
+
+def large_scene(marker_id, cell, sign):
+    """A marker with cells so wide [px] before a warm plate, its top left corner at (79.5, 59.5), and its corners."""
+    grid = np.pad(np.pad(BITS[marker_id], 1), 1, constant_values=1)
+    image = np.full((512, 640), -0.5 * sign * 300.0)
+    side = 8 * cell
+    image[60 - cell : 60 - cell + side, 80 - cell : 80 - cell + side] = (
+        sign * 300.0 * np.kron(grid - 0.5, np.ones((cell, cell)))
+    )
+    image = cv2.GaussianBlur(image, (0, 0), 0.6) + np.random.default_rng(0).normal(7000.0, 1.5, image.shape)
+    corners = np.array([79.5, 59.5]) + 6 * cell * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    return image.astype(np.float32), corners
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.parametrize('cell', [40, 48])
+def test_large_markers_are_found_where_their_sides_are(cell, sign):
+    """Cells are read in their middles: an outline that was off by a third of a cell read as well as the right one."""
+    for marker_id in (0, 7, 17, 49):
+        image, corners = large_scene(marker_id, cell, sign)
+        found = search(image)
+        at = found.ids.tolist().index(marker_id)
+        # 1.7 px at most when written; up to 13 px before.
+        assert np.abs(found.corners_px[at] - corners).max() < FOUND_FROM_PX
+
+
+@pytest.mark.parametrize('off', [(0.8, 0.3), (-0.5, -0.9)])
+@pytest.mark.parametrize('cell', [20, 32])
+def test_large_markers_off_their_predictions_are_found_where_their_sides_are(cell, off):
+    """After seconds without markers a prediction is a centimetre and half a degree off: a cell of a near marker."""
+    for marker_id in (0, 7, 17, 49):
+        image, corners = large_scene(marker_id, cell, 1.0)
+        frame = frame_of(image)
+        x = frame.camera.normalise(corners + cell * np.array(off))[None]
+        expected = ExpectedMarkers(np.array([marker_id]), x, np.ones((1, 4)), np.zeros(1))
+        found = near_prediction(frame, UNKNOWN_TWIST, expected, DECODER, ArucoDetectorConfig())
+        assert found.ids.tolist() == [marker_id]
+        # 1.2 px at most when written; up to 13 px before.
+        assert np.abs(found.places.at.px[0] - corners).max() < FOUND_FROM_PX

@@ -12,7 +12,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.gray_scale import GrayScale, UNKNOWN_SCALE
 from thermal_fiducial.core.detection.corners.refining import CLEAR_CNR
-from thermal_fiducial.core.detection.finding.search import BlindSearch, SearchScales
+from thermal_fiducial.core.detection.finding.search import BlindSearch, large_aligned, SearchScales
 from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
 from thermal_fiducial.core.detection.prediction.frame import Frame, Places, rolling_displacement
 from thermal_fiducial.core.detection.prediction.known_markers import (
@@ -237,6 +237,7 @@ def near_prediction(
     displaced = places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
     ids = expected.ids
     shown = _shifted(frame.image, ids, places.at.px + displaced, decoder)
+    shown = large_aligned(frame.image, shown, ids, decoder)
     reading = decoder.read(frame.image, shown)
     limits = config.guided_min_correlation, config.guided_min_margin, config.guided_min_contrast * frame.noise
     good = (reading.ids == ids) & (reading.turns == 0) & reading.clear(*limits)

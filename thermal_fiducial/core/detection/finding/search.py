@@ -39,6 +39,9 @@ _PICTURE_SIDE = 0.25
 _EDGE_PX, _SHORTER_PX = 0.5, 2.0
 # Width of cells up to which blur merges borders and plates of any margin [px].
 _MERGED_PX = 3.0
+# Width of cells, once to twice as much, in the images in which large markers are aligned [px]: a third of a cell is so
+# little there that an alignment finds it, and what it leaves is less than the 5 px from which sides are found.
+_ALIGNED_PX = 6.0
 _NONE = np.zeros(0, dtype=np.intp)
 
 
@@ -114,7 +117,8 @@ class BlindSearch:
         if not good.any():
             return Outlines.none()
         good &= ~overlapped(reading, quads, good, distinct(reading, frame.noise, config))
-        return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), frame.noise)
+        chosen = _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), frame.noise)
+        return chosen._replace(corners_px=large_aligned(frame.image, chosen.corners_px, chosen.ids, self._decoder))
 
     def _fine_mask(self, frame: Frame, *, clear: bool) -> Gray:
         if frame.displayed:
@@ -150,6 +154,24 @@ class BlindSearch:
             in_half = aligned(half, halfway(quads[rough]), ids, turns, decoder)
             pulled, again = 2.0 * in_half + 0.5, decoder.read(half, in_half, allowed)
         return reading.joined(again), np.concatenate([quads, pulled])
+
+
+def large_aligned(image: Float32Array, corners: FloatArray, ids: IntArray, decoder: Decoder) -> FloatArray:
+    """Corners (N, 4, 2) of markers ``ids`` (N,), those of large ones moved to where their patterns are.
+
+    Cells are read in their middles: outlines that are off by a quarter of a cell are as similar as right ones. Sides
+    are found from a few pixels away.
+    """
+    corners = corners.copy()
+    wider = np.maximum(sides_px(corners) / (_ALIGNED_PX * decoder.cells), 1.0)
+    halvings = np.floor(np.log2(wider)).astype(np.int64)
+    for number in range(1, halvings.max(initial=0) + 1):
+        image, factor = halved(image), 2.0**number
+        which = np.flatnonzero(halvings == number)
+        if len(which):
+            upright, start = np.zeros(len(which), dtype=np.int64), (corners[which] + 0.5) / factor - 0.5
+            corners[which] = (aligned(image, start, ids[which], upright, decoder) + 0.5) * factor - 0.5
+    return corners
 
 
 def _with_shrunk(outlines: FloatArray, cells: int) -> FloatArray:
