@@ -92,14 +92,15 @@ def _fit(values: FloatArray, rate: float, seconds: float) -> AllanFit:
     """Fit N, B and K to samples (N, 3)."""
     longest = max(1, int(np.log2(_LONGEST_SHARE * seconds * rate)))
     wanted = 2.0 ** np.arange(longest + 1) / rate
+    # Rounding gives a constant that is not zero a deviation of its last digits.
+    if np.any(np.ptp(values, axis=0) == 0.0):
+        raise InputError('an axis of the IMU says the same all the time')
     columns = [allantools.oadev(axis, rate=rate, data_type='freq', taus=wanted)[:2] for axis in values.T]
     tau = columns[0][0]
     deviation = np.stack([column[1] for column in columns], axis=1)
     design = np.stack([1.0 / tau, np.full(len(tau), _FLICKER), tau / 3.0], axis=1)
     fitted = []
     for variance in (deviation**2).T:
-        if np.max(variance) <= 0.0:
-            raise InputError('an axis of the IMU says the same all the time')
         # The relative standard deviation of an Allan variance is about one over the root of the number of averages.
         weight = np.sqrt(seconds / tau) / np.maximum(variance, 1e-6 * np.max(variance))
         fitted.append(np.sqrt(nnls(design * weight[:, None], variance * weight)[0]))

@@ -103,6 +103,9 @@ def test_the_command_takes_a_csv_file(tmp_path, capsys):
             'missing for 17 % of the time',
         ),
         (lambda t, v: (t, 0.0 * v), 'says the same'),
+        # A dead axis need not say zero.
+        (lambda t, v: (t, np.where(np.arange(6) == 5, 9.81, v)), 'says the same'),
+        (lambda t, v: (t, np.where(np.arange(6) == 0, 0.0123, v)), 'says the same'),
     ],
 )
 def test_what_is_no_rest_is_refused(change, words):
