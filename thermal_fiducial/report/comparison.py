@@ -123,16 +123,18 @@ def compare(folders: Sequence[Path], truth: Path | None = None) -> Comparison:
 
 
 def _names(folders: Sequence[Path]) -> tuple[str, ...]:
-    """Names of the folders, with the parent folder if two names are the same."""
+    """Names of the folders, with as many parent folders as distinguish them."""
     paths = [folder.resolve() for folder in folders]
-    short = [path.name for path in paths]
-    names = [
-        name if short.count(name) == 1 else f'{path.parent.name}/{name}'
-        for name, path in zip(short, paths, strict=True)
-    ]
-    if len(set(names)) < len(names):
+    if len(set(paths)) < len(paths):
         raise InputError('--compare: a run is given twice')
-    return tuple(names)
+    return tuple(_shortest_name(path, [other for other in paths if other != path]) for path in paths)
+
+
+def _shortest_name(path: Path, others: Sequence[Path]) -> str:
+    """The last parts of ``path`` that none of the ``others`` ends in."""
+    tails = (path.parts[-count:] for count in range(1, len(path.parts) + 1))
+    tail = next(tail for tail in tails if all(other.parts[-len(tail) :] != tail for other in others))
+    return str(Path(*tail))
 
 
 def evo_numbers(estimate: Trajectory, truth: Trajectory) -> dict[str, dict[str, float]]:

@@ -133,3 +133,10 @@ def test_a_run_of_a_robot_at_rest_has_errors_though_nothing_aligns_it(runs, tmp_
 def test_runs_called_alike_have_their_folder_s_name_too(tmp_path):
     folders = [make_run(tmp_path / name / 'run', 2.0, 0, (1.0, 1.4), with_output=False) for name in ('day', 'night')]
     assert compare(folders).names == ('day/run', 'night/run')
+
+
+def test_runs_whose_folders_are_called_alike_too_have_one_more(runs, tmp_path):
+    folders = [tmp_path / name / 'runs' / '1' for name in ('day', 'night')]
+    for folder in folders:
+        copytree(runs[0], folder)
+    assert compare([*folders, runs[1]]).names == ('day/runs/1', 'night/runs/1', 'b')
