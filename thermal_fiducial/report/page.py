@@ -9,6 +9,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.packages import is_installed
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import evaluate, Evaluation
+from thermal_fiducial.report.metrics import TRUTH_HOLE_NS
 from thermal_fiducial.report.run_folder import read_run, SUMMARY
 from thermal_fiducial.report.trajectory import Trajectory
 
@@ -55,12 +56,21 @@ def evaluate_run(
         and evaluation.fused_errors is not None
         and not len(evaluation.fused_errors)
     ):
-        spans = f'{_span(run.truth)}, the run is {_span(run.fused)}'
-        raise InputError(f'{run.truth_path}: ground truth and run {run_dir} have no time in common; it is {spans}')
+        raise InputError(f'{run.truth_path}: {_why_without_errors(run.truth, run.fused, run_dir)}')
     numbers = evaluation.numbers()
     text = json.dumps(run.summary | {'evaluation': numbers}, indent=2)
     write_text(Path(run_dir) / SUMMARY, text + '\n')
     return evaluation, numbers
+
+
+def _why_without_errors(truth: Trajectory, fused: Trajectory, run_dir: Path) -> str:
+    """Why no fused pose has a true one."""
+    begins, ends = (fused.stamps_ns[at] for at in (0, -1))
+    if len(truth) > 1 and truth.stamps_ns[0] <= ends and begins <= truth.stamps_ns[-1]:
+        apart = f'more than {TRUTH_HOLE_NS / SECOND_NS:g} s apart in the time of run {run_dir}'
+        return f'poses of the ground truth are {apart}, and none is taken from between them'
+    spans = f'{_span(truth)}, the run is {_span(fused)}'
+    return f'ground truth and run {run_dir} have no time in common; it is {spans}'
 
 
 def _span(trajectory: Trajectory) -> str:

@@ -84,8 +84,9 @@ def judge(evaluation: Evaluation, numbers: dict[str, Any]) -> RunVerdict:
 
 def _output(evaluation: Evaluation, numbers: dict[str, Any]) -> Remark:
     fused = numbers['fused']
-    if fused['poses'] < 3:
-        return Remark(Weight.FAULT, 'The filter gave no pose.')
+    # Two have no rate.
+    if (poses := fused['poses']) < 3:
+        return Remark(Weight.FAULT, f'The filter gave {number_of(poses, "pose") if poses else "no pose"}.')
     silence = fused.get('silent_at_end_ms', 0.0)
     pause, rate = fused['longest_pause_ms'], f'{fused["rate_hz"]:.0f} poses a second'
     imu_silence = fused.get('imu_silent_at_end_ms', 0.0)

@@ -19,6 +19,7 @@ from thermal_fiducial.report.page import evaluate_run, write_page
 from thermal_fiducial.report.run_folder import read_run
 from thermal_fiducial.report.table import number
 from thermal_fiducial.report.tables import tables
+from thermal_fiducial.report.verdict import judge, Weight
 
 pytest.importorskip('plotly')
 
@@ -214,6 +215,24 @@ def test_unusable_truth_is_refused(tmp_path, small_run, capsys, truth):
     error = capsys.readouterr().err
     assert truth in error
     assert error.count('\n') == 1
+
+
+def test_truth_that_is_too_sparse_is_not_called_one_of_another_time(small_run, capsys):
+    """Of a tracker at 2 Hz, say: both spans were named, and they were the same."""
+    truth = small_run / 'truth.tum'
+    truth.write_text('\n'.join(truth.read_text().splitlines()[::50]) + '\n')
+    assert main(['evaluate', str(small_run)]) == 2
+    error = capsys.readouterr().err
+    assert 'poses of the ground truth are more than 0.2 s apart' in error
+    assert 'no time in common' not in error
+
+
+@pytest.mark.parametrize(('count', 'words'), [(0, 'no pose'), (1, '1 pose'), (2, '2 poses')])
+def test_a_run_of_hardly_any_pose_says_how_many_it_has(small_run, count, words):
+    fused = small_run / 'fused.tum'
+    fused.write_text(''.join(fused.read_text().splitlines(keepends=True)[:count]))
+    remark = judge(*evaluate_run(small_run)).remarks[0]
+    assert (remark.weight, remark.text) == (Weight.FAULT, f'The filter gave {words}.')
 
 
 @pytest.mark.parametrize('replayed', ['bag', 'bag/bag_0.mcap'])
