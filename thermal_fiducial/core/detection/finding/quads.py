@@ -40,7 +40,13 @@ _Image: TypeAlias = np.ndarray[Any, Any]
 
 
 def halved(counts: Float32Array) -> Float32Array:
-    """Half the resolution: means of 2 x 2 pixels, with half the noise."""
+    """Half the resolution: means of 2 x 2 pixels, with half the noise; without the last of odd rows and columns."""
+    height, width = counts.shape
+    return _smaller(counts[: height // 2 * 2, : width // 2 * 2])
+
+
+def _smaller(counts: Float32Array) -> Float32Array:
+    """The whole image at about half the resolution: of odd sizes the places of pixels are stretched."""
     height, width = counts.shape[0] // 2, counts.shape[1] // 2
     return np.asarray(cv2.resize(counts, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
@@ -90,10 +96,10 @@ class DarkRegions:
         scale, size = self._scale, counts.shape[::-1]
         reach = 2 * round(2.5 * scale.smoothing_px) + 1
         self._smooth = cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px, dst=self._smooth)
-        coarse = counts if scale.window_shrink == 1 else halved(counts)
+        coarse = counts if scale.window_shrink == 1 else _smaller(counts)
         window = scale.window_px, scale.window_px
         limit = cv2.blur(self._smooth if scale.window_shrink == 1 else coarse, window)
-        small = halved(coarse)
+        small = _smaller(coarse)
         most = (_MOST_OF_CLEAR if clear else scale.most) * noise
         deviation = np.minimum(cv2.absdiff(small, cv2.blur(small, (_LOCAL, _LOCAL))), most)
         spread = np.maximum(_STD_OF_MEAN * cv2.blur(deviation, (_LOCAL, _LOCAL)), TINY)
@@ -114,7 +120,7 @@ def about_background(counts: Float32Array, most: float) -> Float32Array:
     and leaves out flames and markers (J. Serra, "Image Analysis and Mathematical Morphology", 1982). It has the least
     and the most of the noise, so that a median is taken before, and the mean where it has no such edge.
     """
-    opened = cv2.morphologyEx(cv2.medianBlur(halved(counts), _MEDIAN), cv2.MORPH_OPEN, _WINDOW)
+    opened = cv2.morphologyEx(cv2.medianBlur(_smaller(counts), _MEDIAN), cv2.MORPH_OPEN, _WINDOW)
     background = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _WINDOW)
     mean = cv2.blur(background, (_LOCAL, _LOCAL))
     background = np.where(cv2.absdiff(background, mean) < _NO_EDGE * most, mean, background)
