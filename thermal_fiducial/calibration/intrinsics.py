@@ -4,7 +4,8 @@ Formulation of Z. Zhang, "A flexible new technique for camera calibration", 2000
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -100,8 +101,17 @@ def calibrate(
     if len(sightings) < LEAST_VIEWS:
         raise InputError(f'{number_of(len(sightings), "view")} of the board: a calibration needs {LEAST_VIEWS} or more')
     camera = _start(sightings, width, height, model, focal_px)
-    T = np.stack([board_pose(sighting, camera) for sighting in sightings])
-    return calibrate_from(sightings, camera, T, radius=radius, free=free)
+    posed, poses = list[int](), list[FloatArray]()
+    for index, sighting in enumerate(sightings):
+        # A view that is numbered at random may have no pose at all.
+        with suppress(InputError):
+            poses.append(board_pose(sighting, camera))
+            posed.append(index)
+    if len(posed) < LEAST_VIEWS:
+        raise InputError(f'{number_of(len(sightings) - len(posed), "view")} from which no pose of the board follows')
+    fit = calibrate_from([sightings[index] for index in posed], camera, np.stack(poses), radius=radius, free=free)
+    views = np.array(posed)[fit.views]
+    return replace(fit, views=views, dropped=sorted(set(range(len(sightings))) - set(views.tolist())))
 
 
 def calibrate_from(

@@ -91,6 +91,26 @@ def test_views_that_do_not_belong_are_dropped():
     assert found.rms_px < 0.04
 
 
+@pytest.mark.parametrize('seed', range(4))
+def test_a_view_that_is_numbered_at_random_keeps_no_others_from_being_used(seed):
+    """It may have no pose, from whatever camera: then there was no calibration, and no name of the view."""
+    views = sightings(LENSES['13mm'], 9, 0.02, 4)
+    views[3] = Sighting(views[3].points, np.random.default_rng(seed).permutation(views[3].pixels))
+    found = calibrate(views, 640, 512, 'plumb_bob')
+    # From the first camera, which the random view spoils, another one may have no pose either.
+    assert 3 in found.dropped
+    assert len(found.dropped) <= 2
+    assert sorted([*found.views.tolist(), *found.dropped]) == list(range(9))
+    assert found.rms_px < 0.04
+
+
+def test_views_of_which_too_few_have_a_pose():
+    rng, views = np.random.default_rng(0), sightings(LENSES['13mm'], 6, 0.02, 4)
+    scattered = [Sighting(view.points, rng.permutation(view.pixels)) for view in views]
+    with pytest.raises(InputError, match='from which no pose of the board follows'):
+        calibrate(scattered, 640, 512, 'plumb_bob')
+
+
 def test_centroids_of_circles_are_not_their_centres():
     # 24 mm discs 0.4 m away: seen obliquely their centroids lie up to a few tenths of a pixel off their centres.
     lens = LENSES['13mm']
