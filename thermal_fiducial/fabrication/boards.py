@@ -10,9 +10,9 @@ from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing
 from thermal_fiducial.fabrication.plate import arrow, mounting_points, PlateOptions, text, WALL_MM
 from thermal_fiducial.fabrication.shape import contour, Rectangle, trace
 
-#: Most circles of a board: more would be too small for any camera, and fill the memory.
 #: Fewest markers of a board, and of it in a view: four corners alone fit any view.
 LEAST_MARKERS = 2
+# Most circles of a board: more would be too small for any camera, and fill the memory.
 _MOST_CIRCLES = 10_000
 
 
