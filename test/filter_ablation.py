@@ -56,7 +56,7 @@ MECHANISMS = {
             'update:_in_map_of_markers',
             'update:map_jacobian',
         ),
-        {'update:_with_markers': lambda estimate, _: estimate},
+        {'update:_with_markers': lambda config, estimate, _: estimate},
     ),
     'size of white errors is learned': Mechanism(
         ('noise of poses', 'lasting errors'),

@@ -41,9 +41,9 @@ from thermal_fiducial.core.types import FloatArray
 #: offset, 1 to 2 times n' diag(S^-1) n, growing with the gain. It is taken away; the offset's variance at most doubles
 #: in one step.
 _SPURIOUS, _LEAST_KEPT = 1.5, 0.5
-#: Variance of the position that an estimate may give up to go on in the map of worse markers, as a share of what its
-#: own map is off by. From 0.03 to 0.3 recorded carpets and random rigs are alike; with less the estimate stays in its
-#: map for long, and the IMU decides between maps, off by the error of the mount.
+#: Share of ``lost_position_std`` that an estimate may give up to go on in the map of worse markers. Up to 0.2 random
+#: rigs are alike, with 0.35 one of them is lost. Were it to give up nothing, the IMU would decide between maps that
+#: hardly differ.
 _LITTLE = 0.1
 _SIX = np.arange(6)
 #: Copied for every update, as an update leaves its results in the object.
@@ -120,7 +120,7 @@ def map_jacobian(state: NavigationState) -> FloatArray:
 
 def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, motion: MotionAtPose) -> Innovation:
     """Innovation of ``pose`` against ``estimate`` at the same instant."""
-    prior = _with_markers(_in_view(config, estimate, pose), pose)
+    prior = _with_markers(config, _in_view(config, estimate, pose), pose)
     derivative = prior.state.derivative(motion.imu)
     H = np.zeros((6, SIZE))
     H[_SIX, POSE] = 1.0
@@ -207,7 +207,7 @@ def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estim
     return replace(estimate, state=state, covariance=P)
 
 
-def _with_markers(estimate: Estimate, pose: BodyPose) -> Estimate:
+def _with_markers(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estimate:
     """The estimate with the map's error propagated to the markers of ``pose``: a random walk from those of the last.
 
     The estimate goes on in the map as they have it where that is better than its own, or where little is lost by it.
@@ -220,10 +220,11 @@ def _with_markers(estimate: Estimate, pose: BodyPose) -> Estimate:
     since_last, apart = now.map_changes(np.stack((noise.last.map_covariance, noise.of_map)))
     P[MARKERS, MARKERS] += since_last
     estimate = replace(estimate, covariance=P)
-    of_map, of_change, own = now.moved_by(noise.of_map), now.moved_by(apart), P[POSITION, POSITION].trace()
+    of_change, own = now.moved_by(apart), P[POSITION, POSITION].trace()
     # In a map of its own the estimate would know its place by the markers and by itself, in theirs by them alone.
     cost = of_change - of_change * own / (of_change + own)
-    if now.moved_by(now.map_covariance) > of_map and cost > _LITTLE * of_map:
+    is_worse = now.moved_by(now.map_covariance) > now.moved_by(noise.of_map)
+    if is_worse and cost > (_LITTLE * config.lost_position_std) ** 2:
         return estimate
     if now.moved_by(P[MARKERS, MARKERS]) > now.moved_by(apart):
         # The random walk knows less than the two covariances: the markers in between were worse.

@@ -394,6 +394,15 @@ def test_of_a_drifted_estimate_and_poorly_mapped_markers_both_are_used(estimate,
     assert after.position_std == pytest.approx((0.25**-2 + 0.2**-2) ** -0.5, rel=0.02)
 
 
+def test_the_estimate_goes_on_in_a_map_that_is_hardly_worse(estimate, still):
+    """It stayed in that of one exact marker, and the IMU drew it 2 mm away from markers known to a millimetre."""
+    T, R = estimate.state.T_map_body, 1e-6 * np.eye(6)
+    begun = replace(known(estimate, 1e-4), pose_noise=PoseNoise.of(BodyPose(T, R)))
+    hardly = 1e-6 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    prior = innovation_of(FULL, begun, BodyPose(T, R, hardly), still).prior
+    np.testing.assert_array_equal(prior.pose_noise.of_map, hardly)
+
+
 def test_a_motion_of_the_map_moves_pose_velocity_and_gravity(estimate):
     state, step = estimate.state, 1e-6
     for column in range(6):
