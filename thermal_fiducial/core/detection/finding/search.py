@@ -162,15 +162,15 @@ def large_aligned(image: Float32Array, corners: FloatArray, ids: IntArray, decod
     Cells are read in their middles: outlines that are off by a quarter of a cell are as similar as right ones. Sides
     are found from a few pixels away.
     """
-    corners = corners.copy()
+    at, corners = corners, corners.copy()
     wider = np.maximum(sides_px(corners) / (_ALIGNED_PX * decoder.cells), 1.0)
     halvings = np.floor(np.log2(wider)).astype(np.int64)
     for number in range(1, halvings.max(initial=0) + 1):
-        image, factor = halved(image), 2.0**number
+        image, at = halved(image), halfway(at)
         which = np.flatnonzero(halvings == number)
         if len(which):
-            upright, start = np.zeros(len(which), dtype=np.int64), (corners[which] + 0.5) / factor - 0.5
-            corners[which] = (aligned(image, start, ids[which], upright, decoder) + 0.5) * factor - 0.5
+            upright = np.zeros(len(which), dtype=np.int64)
+            corners[which] += 2.0**number * (aligned(image, at[which], ids[which], upright, decoder) - at[which])
     return corners
 
 
