@@ -34,12 +34,12 @@ _MEMORY = np.array((10.0, 300.0, 300.0))
 _PRIOR, _LARGEST_SQUARE = 5.0, 9.0
 #: A pose that claims less of a turn [rad] says nothing of it: a third of what the mapper claims then.
 _UNKNOWN_TURN = NOTHING_KNOWN / 3.0
-ORIGIN = np.zeros(3)
 #: Least covariance of a pose: rounding of float32 corners [rad, m].
 _ROUNDING = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
+_ORIGIN = np.zeros(3)
 
 
-def displacement_of_body(T_map_body: FloatArray, about: FloatArray = ORIGIN) -> FloatArray:
+def displacement_of_body(T_map_body: FloatArray, about: FloatArray = _ORIGIN) -> FloatArray:
     """Map (6, 6) from a displacement in the map, position first, to that of the robot in its frame, rotation first.
 
     ``about`` (3,): the displaced point in the map [m]; a motion of the map is one about its origin.
