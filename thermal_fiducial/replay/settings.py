@@ -26,7 +26,7 @@ from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
 from thermal_fiducial.files.marker_map import load_map, other_frame
-from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.parameter_sections import load_sections
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
 
@@ -68,7 +68,7 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any], second_came
         An unreadable file, a parameter that no node has, a value of the wrong type or out of range, or an unusable file
         named by a parameter.
     """
-    document = {} if params is None else _document(params)
+    document = {} if params is None else load_sections(params)
     overrides = dict(overrides) | ({'second_camera': second_camera} if second_camera else {})
     for kind in NODES.values():
         # An option is not blamed on the file.
@@ -144,25 +144,6 @@ def _whole_numbers(document: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
             given = value if isinstance(value, list) else [value]
             if isinstance(due, float) and any(type(number) is int for number in given):
                 yield f'parameter {name}: on a robot ROS refuses {value}: each number needs a point, as 1.0'
-
-
-def _document(path: Path) -> dict[str, dict[str, Any]]:
-    """Node pattern to its parameters, names joined by dots."""
-    document = load_plain(path)
-    sections = document if isinstance(document, dict) else {}
-    if not sections or not all(
-        isinstance(s, dict) and isinstance(s.get('ros__parameters'), dict) for s in sections.values()
-    ):
-        raise InputError(f'parameter file {path}: not of the form NODE: {{ros__parameters: {{...}}}}')
-    return {str(node): dict(_flat(section['ros__parameters'], '')) for node, section in sections.items()}
-
-
-def _flat(section: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for name, value in section.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f'{prefix}{name}.')
-        else:
-            yield f'{prefix}{name}', value
 
 
 def _config(node: str, values: dict[str, Any], overrides: Mapping[str, Any]) -> Any:

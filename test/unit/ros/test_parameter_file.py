@@ -78,6 +78,26 @@ def test_sections_of_other_nodes_are_not_checked(tmp_path):
     assert read_settings(file, {}).warnings == (f'{file}: nothing in it is for our nodes: it is for /mavros',)
 
 
+def test_namespaces_may_be_nested_as_in_ros(tmp_path):
+    """A replay refused a file with which the nodes fly."""
+    file = tmp_path / 'rig.yaml'
+    file.write_text(
+        'drone: {deep: {pose_ekf: {ros__parameters: {gravity: 9.79}}}}\n/**: {ros__parameters: {gate: 30.0}}'
+    )
+    settings = read_settings(file, {})
+    assert (settings.pose_ekf.gravity, settings.pose_ekf.gate) == (9.79, 30.0)
+
+
+@pytest.mark.parametrize(
+    'content', ['', '[]', '/**:', '/**: {}', 'drone: {pose_ekf: 1}', 'pose_ekf: {ros__parameters: 1}']
+)
+def test_what_is_no_parameter_file_is_refused(tmp_path, content):
+    file = tmp_path / 'rig.yaml'
+    file.write_text(content)
+    with pytest.raises(InputError, match=r'rig\.yaml: not of the form NODE: \{ros__parameters: \{\.\.\.\}\}$'):
+        read_settings(file, {})
+
+
 def test_an_option_is_not_blamed_on_the_file():
     with pytest.raises(InputError, match=r"^parameter second_camera: '7' is not the name of a namespace"):
         read_settings(FILE, {}, second_camera='7')

@@ -1,0 +1,49 @@
+"""Files of ROS parameters: their sections, each for the nodes that its name matches."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.plain_yaml import load_plain
+
+_PARAMETERS = 'ros__parameters'
+
+
+def load_sections(path: Path) -> dict[str, dict[str, Any]]:
+    """Name of each section (``/**``, ``/drone/pose_ekf``) to its parameters, whose nested names are joined by dots.
+
+    Raises
+    ------
+    InputError
+        Unreadable, or not the form of such a file.
+    """
+    document = load_plain(path)
+    if not isinstance(document, dict) or not document:
+        raise _no_parameters(path)
+    return dict(_sections(path, document, ''))
+
+
+def _sections(path: Path, document: Mapping[str, Any], namespace: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Sections of a namespace, which may be nested as ROS has it: ``drone: {pose_ekf: {ros__parameters: {...}}}``."""
+    for name, content in document.items():
+        if not isinstance(content, dict) or not content:
+            raise _no_parameters(path)
+        if _PARAMETERS not in content:
+            yield from _sections(path, content, f'{namespace}{name}/')
+        elif isinstance(content[_PARAMETERS], dict):
+            yield f'{namespace}{name}', dict(_flat(content[_PARAMETERS], ''))
+        else:
+            raise _no_parameters(path)
+
+
+def _flat(section: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, value in section.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}', value
+
+
+def _no_parameters(path: Path) -> InputError:
+    return InputError(f'parameter file {path}: not of the form NODE: {{{_PARAMETERS}: {{...}}}}')
