@@ -925,6 +925,26 @@ SHARED_WITH_SECOND_CAMERA = ('marker_map', 'odometry', 'camera_clock')
 OPTIONAL_NODES: dict[str, type] = {'thermal_source': ThermalSourceConfig, 'landing_target': LandingTargetConfig}
 
 
+def meant_node(section: str, names: Iterable[str]) -> str:
+    """The node that a section of a parameter file is meant for, if its name is mistyped; empty if it is not.
+
+    Sections for nodes of other packages may have any names: one is meant for a node of ours if its name is similar
+    and all its parameters are that node's.
+
+    Parameters
+    ----------
+    section : its name, as ``/drone/pose_ekf``
+    names : its parameters
+    """
+    nodes = NODES | OPTIONAL_NODES
+    name = section.rpartition('/')[2]
+    close = [] if name in nodes else difflib.get_close_matches(name.lower(), nodes, 1)
+    if not close:
+        return ''
+    own = {name for name, _, _ in parameters(nodes[close[0]])}
+    return close[0] if own.intersection(names) and set(names) <= own.union(_OF_ROS) else ''
+
+
 def check_names(names: Iterable[str]) -> None:
     """Refuse a parameter that no node has, most likely a mistyped name.
 

@@ -4,8 +4,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from thermal_fiducial.config import meant_node
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.reading import shown
 
 _PARAMETERS = 'ros__parameters'
 
@@ -22,6 +24,13 @@ def load_sections(path: Path) -> dict[str, dict[str, Any]]:
     if not isinstance(document, dict) or not document:
         raise _no_parameters(path)
     return dict(_sections(path, document, ''))
+
+
+def mistyped_sections(sections: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
+    """The node that each section with a mistyped name is meant for, and a warning that it gets nothing of it."""
+    for section, values in sections.items():
+        if node := meant_node(section, values):
+            yield node, f'section {shown(section)}: no node of ours is called so; did you mean {node}?'
 
 
 def _sections(path: Path, document: Mapping[str, Any], namespace: str) -> Iterator[tuple[str, dict[str, Any]]]:

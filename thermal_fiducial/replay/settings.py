@@ -26,7 +26,7 @@ from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
 from thermal_fiducial.files.marker_map import load_map, other_frame
-from thermal_fiducial.files.parameter_sections import load_sections
+from thermal_fiducial.files.parameter_sections import load_sections, mistyped_sections
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
 
@@ -84,7 +84,8 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any], second_came
     warnings = _check_files(settings)
     if document and not any(_values_for(node, document, seconds) for node in NODES):
         warnings.append(f'{params}: nothing in it is for our nodes: it is for {", ".join(document)}')
-    warnings += [f'{params}: {doubt}' for doubt in _whole_numbers(document)]
+    doubts = [line for _, line in mistyped_sections(document)]
+    warnings += [f'{params}: {doubt}' for doubt in (*doubts, *_whole_numbers(document))]
     return replace(settings, warnings=tuple(warnings))
 
 

@@ -3,14 +3,18 @@
 from pathlib import Path
 
 import pytest
+from support.empty_stage import finished
 from support.small_bag import side_files
 import yaml
 
 from thermal_fiducial.config import from_mapping, NODES, OPTIONAL_NODES, parameters
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.replay.settings import read_settings
+from thermal_fiducial.ros.base import params
 from thermal_fiducial.ros.parameter_file import parameter_file
 
+#: A section that all nodes have.
+OURS = {'/**': {'ros__parameters': {'marker_size': 0.3}}}
 FILE = Path(__file__).resolve().parents[3] / 'config' / 'thermal_fiducial.yaml'
 
 
@@ -76,6 +80,54 @@ def test_sections_of_other_nodes_are_not_checked(tmp_path):
     assert read_settings(file, {}).warnings == ()
     file.write_text(yaml.safe_dump(theirs))
     assert read_settings(file, {}).warnings == (f'{file}: nothing in it is for our nodes: it is for /mavros',)
+
+
+@pytest.mark.parametrize('section', ['pose_efk', '/drone/pose_ekf_node', '/**/PoseEkf', 'drone/pose-ekf'])
+def test_a_section_for_a_mistyped_node_is_warned_of(tmp_path, section):
+    """Nothing was said, and the robot flew with the defaults."""
+    file = tmp_path / 'rig.yaml'
+    file.write_text(yaml.safe_dump({section: {'ros__parameters': {'gate': 30.0, 'use_sim_time': False}}, **OURS}))
+    words = f'{file}: section {section}: no node of ours is called so; did you mean pose_ekf?'
+    assert list(read_settings(file, {}).warnings) == [words]
+
+
+@pytest.mark.parametrize(
+    ('section', 'values'),
+    [
+        ('aruco_detect', {'dictionary': 7, 'fiducial_len': 0.14}),
+        ('tau2_camera_driver', {'frame_rate': 30.0}),
+        ('pose_ekf2', {'use_sim_time': True}),
+        ('camera_driver', {'camera': '/dev/video0'}),
+        ('pose_ekf', {'gate': 30.0}),
+    ],
+)
+def test_nodes_of_others_may_have_names_like_ours(tmp_path, section, values):
+    file = tmp_path / 'rig.yaml'
+    file.write_text(yaml.safe_dump({section: {'ros__parameters': values}, **OURS}))
+    assert read_settings(file, {}).warnings == ()
+
+
+@pytest.mark.ros
+def test_the_node_whose_section_is_mistyped_warns_of_it(tmp_path):
+    file = tmp_path / 'rig.yaml'
+    file.write_text(yaml.safe_dump({'pose_efk': {'ros__parameters': {'gate': 30.0}}}))
+    (line,) = params.mistyped_for('pose_ekf', ['node', '--ros-args', '--params-file', str(file), '-r', 'a:=b'])
+    assert line == f'{file}: section pose_efk: no node of ours is called so; did you mean pose_ekf?'
+    assert not [*params.mistyped_for('tau2_camera', ['--ros-args', '--params-file', str(file)])]
+    program = """
+import os, signal, sys
+from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
+from thermal_fiducial.ros.process import run
+
+class Stopped(PoseEkfNode):
+    def diagnose(self, stamp_ns):
+        print(*self.remarks, flush=True)
+        os.kill(os.getpid(), signal.SIGINT)
+
+sys.exit(run.run(Stopped))
+"""
+    done = finished(program, '--ros-args', '--params-file', str(file))
+    assert (done.returncode, line in done.stderr, line in done.stdout) == (0, True, True), done.stdout + done.stderr
 
 
 def test_namespaces_may_be_nested_as_in_ros(tmp_path):

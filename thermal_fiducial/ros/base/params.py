@@ -1,7 +1,10 @@
 """ROS parameters from the config dataclasses: declaration with descriptor, validation, dynamic changes."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import Field
+from itertools import pairwise
+from pathlib import Path
 from typing import Any, get_args
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -11,6 +14,7 @@ from rclpy.parameter import Parameter
 
 from thermal_fiducial.config import check_names, Config, from_mapping, parameters, QOS_OVERRIDES
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
+from thermal_fiducial.files.parameter_sections import load_sections, mistyped_sections
 
 _ARRAYS = {
     float: Parameter.Type.DOUBLE_ARRAY,
@@ -58,6 +62,19 @@ def _remedy(given: Parameter | None, default: Any) -> str:
         return ''
     written = ', '.join(str(float(value)) for value in values)
     return f'ROS refuses whole numbers here, write {f"[{written}]" if several else written}'
+
+
+def mistyped_for(node: str, args: Sequence[str]) -> Iterator[str]:
+    """A warning for each section of the parameter files in ``args`` whose mistyped name is meant for ``node``.
+
+    A node that was given another name has none: only who gave it knows how it is spelt.
+    """
+    for file in (value for flag, value in pairwise(args) if flag == '--params-file'):
+        # ROS has read the file; what we would refuse in it is not refused here.
+        with suppress(InputError):
+            for meant, line in mistyped_sections(load_sections(Path(file))):
+                if meant == node:
+                    yield f'{file}: {line}'
 
 
 def follow(node: Node, kind: type[Config], apply: Callable[[Config], None]) -> None:

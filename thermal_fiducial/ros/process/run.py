@@ -16,6 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.base import params
 from thermal_fiducial.ros.base.node import StageNode
 from thermal_fiducial.ros.process.litter import remove_litter
 from thermal_fiducial.ros.process.promptness import keep_for_good, take_priority
@@ -166,6 +167,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             _refuse_others(args)
             node = _made(make_node)
             ending.callback(node.destroy_node)
+            node.remark(params.mistyped_for(node.get_name(), sys.argv if args is None else args))
             executor = make_executor()
             ending.callback(executor.shutdown)
             ending.push(limit_the_end)
