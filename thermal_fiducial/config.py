@@ -227,6 +227,18 @@ def _number(name: str, value: Any) -> float:
     return float(value)
 
 
+def for_whole_numbers(value: Any, default: Any) -> str:
+    """What to do about whole numbers in the value of a parameter, where ROS refuses them; empty if it does not."""
+    several = isinstance(default, tuple)
+    if isinstance(value, list) != several:
+        return ''
+    given, due = (value, default[:1]) if several else ([value], (default,))
+    if {type(number) for number in due} != {float} or not any(type(number) is int for number in given):
+        return ''
+    written = ', '.join(str(float(number)) if type(number) is int else str(number) for number in given)
+    return f'ROS refuses whole numbers here, write {f"[{written}]" if several else written}'
+
+
 def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
     """Marker ID to side [m] from strings "ID:SIZE".
 

@@ -11,6 +11,7 @@ import yaml
 from thermal_fiducial.config import (
     ArucoDetectorConfig,
     check_names,
+    for_whole_numbers,
     from_mapping,
     MarkerMapperConfig,
     NODES,
@@ -140,11 +141,8 @@ def _whole_numbers(document: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     ours = (values for pattern, values in document.items() if pattern.rsplit('/', 1)[-1] in ('**', '*', *NODES))
     for values in ours:
         for name, value in values.items():
-            default = defaults.get(name)
-            due = default[0] if isinstance(default, tuple) and default else default
-            given = value if isinstance(value, list) else [value]
-            if isinstance(due, float) and any(type(number) is int for number in given):
-                yield f'parameter {name}: on a robot ROS refuses {value}: each number needs a point, as 1.0'
+            if name in defaults and (remedy := for_whole_numbers(value, defaults[name])):
+                yield f'parameter {name}: on a robot {remedy}'
 
 
 def _config(node: str, values: dict[str, Any], overrides: Mapping[str, Any]) -> Any:

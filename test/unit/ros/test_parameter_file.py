@@ -62,15 +62,15 @@ def test_numbers_are_what_ros_takes_for_numbers(tmp_path, number):
         read_settings(file, {})
 
 
-@pytest.mark.parametrize(('value', 'refused'), [('1', '1'), ('[0, 0.5, 1.0]', '[0, 0.5, 1.0]'), ('1.0', '')])
-def test_whole_numbers_that_a_node_would_refuse_are_warned_of(tmp_path, value, refused):
+@pytest.mark.parametrize(('value', 'due'), [('1', '1.0'), ('[0, 0.5, 1.0]', '[0.0, 0.5, 1.0]'), ('1.0', '')])
+def test_whole_numbers_that_a_node_would_refuse_are_warned_of(tmp_path, value, due):
     """A rig file that served a replay ended the nodes of the robot."""
     name = 'camera_position' if ',' in value else 'marker_size'
     file = tmp_path / 'rig.yaml'
     others = '/camera_driver: {ros__parameters: {gravity: 9}}'
     file.write_text(f'/**: {{ros__parameters: {{{name}: {value}, bits: 14}}}}\n{others}')
-    words = f'{file}: parameter {name}: on a robot ROS refuses {refused}: each number needs a point, as 1.0'
-    assert list(read_settings(file, {}).warnings) == [words] * bool(refused)
+    words = f'{file}: parameter {name}: on a robot ROS refuses whole numbers here, write {due}'
+    assert list(read_settings(file, {}).warnings) == [words] * bool(due)
 
 
 def test_sections_of_other_nodes_are_not_checked(tmp_path):

@@ -12,7 +12,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from thermal_fiducial.config import check_names, Config, from_mapping, parameters, QOS_OVERRIDES
+from thermal_fiducial.config import check_names, Config, for_whole_numbers, from_mapping, parameters, QOS_OVERRIDES
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.parameter_sections import load_sections, mistyped_sections
 
@@ -47,21 +47,9 @@ def declare(node: Node, kind: type[Config]) -> Config:
         try:
             _declare(node, name, item, default)
         except ParameterException as error:
-            reason = str(error).removesuffix(f': {name}')
-            raise InputError(f'parameter {name}: {_remedy(given.get(name), default) or reason}') from None
+            remedy = for_whole_numbers(given[name].value, default) if name in given else ''
+            raise InputError(f'parameter {name}: {remedy or str(error).removesuffix(f": {name}")}') from None
     return from_mapping(kind, current_values(node, kind))
-
-
-def _remedy(given: Parameter | None, default: Any) -> str:
-    """What to write in place of whole numbers, which ROS refuses for others; empty for another fault."""
-    several = isinstance(default, tuple)
-    if given is None or isinstance(given.value, list) != several:
-        return ''
-    values, due = (given.value, default[:1]) if several else ([given.value], (default,))
-    if {type(value) for value in due} != {float} or {type(value) for value in values} != {int}:
-        return ''
-    written = ', '.join(str(float(value)) for value in values)
-    return f'ROS refuses whole numbers here, write {f"[{written}]" if several else written}'
 
 
 def mistyped_for(node: str, args: Sequence[str]) -> Iterator[str]:
