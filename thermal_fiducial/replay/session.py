@@ -16,7 +16,6 @@ from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.dictionary import copied_beside
-from thermal_fiducial.files.map_format import read_document
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.writing import into, write_text
 from thermal_fiducial.replay.job import ReplayJob
@@ -224,18 +223,17 @@ def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[
             warn('no map (--map): without one marker of known pose there is nothing to find the camera from')
         return arguments
     if Path(given).resolve() != run_map.resolve():
-        _copy_map(Path(given), run_map)
+        _copy_map(Path(given), run_map, settings.map_dictionary)
     return [*arguments, '-p', f'map_file:={json.dumps(str(run_map))}']
 
 
-def _copy_map(given: Path, run_map: Path) -> None:
-    """Copy a map, and its dictionary file, which each map has beside itself."""
+def _copy_map(given: Path, run_map: Path, dictionary: str) -> None:
+    """Copy a map, and the file of its ``dictionary``, which each map has beside itself."""
     with into(run_map):
         shutil.copyfile(given, run_map)
-    name = read_document(str(given)).dictionary
-    own = given.parent / name
+    own = given.parent / dictionary
     copy = copied_beside(str(own), run_map.parent)
-    if copy is not None and name == own.name and own.is_file():
+    if copy is not None and dictionary == own.name and own.is_file():
         with into(copy):
             shutil.copyfile(own, copy)
 

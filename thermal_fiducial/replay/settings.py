@@ -42,6 +42,8 @@ class Settings:
     pose_ekf: PoseEkfConfig
     #: front end and detector of a second camera, whose name the mapper's parameters have
     second: tuple[Tau2CameraConfig, ArucoDetectorConfig] | None = None
+    #: dictionary of the map, as its file names it; empty without a map
+    map_dictionary: str = ''
     #: warnings about usable but suspicious values
     warnings: tuple[str, ...] = ()
 
@@ -82,12 +84,12 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any], second_came
         if second_camera:
             own = (_config(node, _values_for_second(node, document, second_camera), overrides) for node in OF_CAMERA)
             settings = replace(settings, second=tuple(own))
-    warnings = _check_files(settings)
+    map_dictionary, warnings = _check_files(settings)
     if document and not any(_values_for(node, document, seconds) for node in NODES):
         warnings.append(f'{params}: nothing in it is for our nodes: it is for {", ".join(document)}')
     doubts = [line for _, line in mistyped_sections(document)]
     warnings += [f'{params}: {doubt}' for doubt in (*doubts, *_whole_numbers(document))]
-    return replace(settings, warnings=tuple(warnings))
+    return replace(settings, map_dictionary=map_dictionary, warnings=tuple(warnings))
 
 
 def load_config(path: str | Path | None = None, **overrides: Any) -> PipelineConfig:
@@ -113,8 +115,13 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> PipelineCon
     return PipelineConfig(settings.tau2_camera, settings.aruco_detector, settings.marker_mapper, settings.pose_ekf)
 
 
-def _check_files(settings: Settings) -> list[str]:
-    """Validate files named by parameters: raises what a node would report as a fault, returns its warnings."""
+def _check_files(settings: Settings) -> tuple[str, list[str]]:
+    """Validate files named by parameters: raises what a node would report as a fault.
+
+    Returns
+    -------
+    Dictionary of the map, empty without a map; warnings of a node.
+    """
     mapper = settings.marker_mapper
     dictionary = load_dictionary(settings.aruco_detector.dictionary)
     sizes = size_overrides(mapper.marker_size_overrides)
@@ -131,8 +138,8 @@ def _check_files(settings: Settings) -> list[str]:
         folder = Path(mapper.map_file).parent
         other = other_patterns(marker_map.markers, marker_map.dictionary, settings.aruco_detector.dictionary, folder)
         frame = other_frame(marker_map.frame_id, mapper.map_frame)
-        return [f'{mapper.map_file}: {doubt}' for doubt in (other, frame) if doubt]
-    return []
+        return marker_map.dictionary, [f'{mapper.map_file}: {doubt}' for doubt in (other, frame) if doubt]
+    return '', []
 
 
 def _whole_numbers(document: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
