@@ -31,6 +31,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.dictionary import (
+    bring_beside,
     dictionary_of_map,
     not_in_dictionary,
     other_patterns,
@@ -113,6 +114,7 @@ def _build(args: argparse.Namespace) -> int:
     if args.origin is not None and not any(args.origin in rows['id'] for rows in frames):
         origin = f'marker {args.origin} of {args.dictionary}'
         raise InputError(f'{args.images}: {origin}, the origin, is in none of the {number_of(len(frames), "photo")}')
+    bring_beside(args.dictionary, args.out.parent)
     config = _mapper_config(args, start.dictionary)
     return _grow(frames, camera, start, config, work, [photo.name for photo in photos])
 
@@ -229,20 +231,20 @@ def _mapper_config(args: argparse.Namespace, dictionary: str) -> MarkerMapperCon
 
 
 def _start(args: argparse.Namespace) -> MarkerMap:
-    """Map to start from; sets ``args.dictionary`` to its dictionary."""
+    """Map to start from; sets ``args.dictionary`` to its dictionary, of which the map has the name without a path."""
     sizes = size_overrides(tuple(args.marker_size_override))
     if args.map is not None:
         known = load_map(args.map, args.marker_size, sizes)
         args.dictionary = args.dictionary or dictionary_of_map(known.dictionary, args.map.parent)
         if other := other_patterns(known.markers, known.dictionary, args.dictionary, args.map.parent):
             raise InputError(f'{args.map}: {other}')
-        return known
+        return replace(known, dictionary=Path(args.dictionary).name)
     args.dictionary = args.dictionary or _DICTIONARY
     size = sizes.get(args.origin, args.marker_size)
     if size is None:
         raise InputError('map build --origin needs --marker-size')
     origin = MapMarker(args.origin, size, True, np.eye(4))
-    return MarkerMap({args.origin: origin}, dictionary=args.dictionary)
+    return MarkerMap({args.origin: origin}, dictionary=Path(args.dictionary).name)
 
 
 def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, camera: Camera) -> list[Markers]:

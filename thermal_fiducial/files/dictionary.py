@@ -24,7 +24,7 @@ import yaml
 from thermal_fiducial.core.detection.patterns import correctable_bits, Dictionary
 from thermal_fiducial.core.types import Gray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.reading import read_text
+from thermal_fiducial.files.reading import is_there, read_text
 from thermal_fiducial.files.schema import parse_yaml, Value
 from thermal_fiducial.files.writing import write_text
 
@@ -125,6 +125,23 @@ def copied_beside(name: str, folder: Path) -> Path | None:
     """Where in ``folder`` a map finds a copy of its dictionary file; None for a known name, or if it is that file."""
     copy = folder / Path(name).name
     return copy if is_own_file(name) and copy.resolve() != Path(name).resolve() else None
+
+
+def bring_beside(name: str, folder: Path) -> None:
+    """Copy a dictionary file into the ``folder`` of a map, which names it without a path; nothing for a known name.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or written, or another one has its place.
+    """
+    copy = copied_beside(name, folder)
+    if copy is None:
+        return
+    text = read_text(name)
+    if is_there(copy) and read_text(copy) != text:
+        raise InputError(f'{copy}: not the dictionary {name}, which a map in its folder would look for there')
+    write_text(copy, text)
 
 
 def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: Dictionary, comment: str = '') -> None:

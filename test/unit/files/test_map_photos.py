@@ -12,7 +12,7 @@ from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, reproject
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.files.camera_info import save_camera
-from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary
 from thermal_fiducial.files.marker_map import load_map, save_map
 
 DICTIONARY = 'STENCIL_4X4_100'
@@ -66,6 +66,23 @@ def test_photos_are_read_in_the_dictionary_of_the_map(photographed, poses, tmp_p
         d = difference(built.markers[key].T_map_marker, T)
         assert np.linalg.norm(d[:3]) < 0.03
         assert np.linalg.norm(d[3:]) < 0.05
+
+
+@pytest.mark.parametrize('begins_with', ['origin', 'map'])
+def test_a_map_in_a_dictionary_file_finds_it_beside_itself(photographed, poses, tmp_path, capsys, begins_with):
+    """It had the path of the file, which the rules of maps refuse."""
+    own, start, out = tmp_path / 'own.yaml', tmp_path / 'start.yaml', tmp_path / 'maps' / 'hall.yaml'
+    out.parent.mkdir()
+    save_dictionary(own, 'own', load_dictionary(DICTIONARY))
+    save_map(start, MarkerMap({2: MapMarker(2, SIZE, True, poses[2])}, dictionary=own.name))
+    first = ['--origin', 2, '--marker-size', SIZE, '--dictionary', own] if begins_with == 'origin' else ['--map', start]
+    assert build(photographed, *first, '--out', out) == 0
+    assert load_map(out).dictionary == own.name
+    assert f'{out}: sound' in capsys.readouterr().out
+    (out.parent / own.name).write_text('other: things')
+    assert build(photographed, *first, '--out', out) == 2
+    assert f'{out.parent / own.name}: not the dictionary {own}, which a map' in capsys.readouterr().err
+    assert (out.parent / own.name).read_text() == 'other: things'
 
 
 def test_a_photo_that_gave_nothing_is_named_with_its_reason(photographed, poses, tmp_path, capsys):
