@@ -63,7 +63,7 @@ def strip(run: Run, bag: Path | None = None) -> list[FramePicture]:
     pictures = []
     with replayed as reader:
         for wanted in _even(np.unique(stamps)):
-            view = view_at(reader, int(wanted))
+            view = view_at(reader, int(wanted), run.front_end)
             if view is not None and view.pixels is not None:
                 drawn = annotated(view.pixels, run.detections, view.stamp_ns)
                 count = int(np.sum(stamps == view.stamp_ns))
@@ -78,23 +78,25 @@ def _even(stamps_ns: IntArray) -> IntArray:
     return np.unique(stamps_ns[np.clip(np.searchsorted(stamps_ns, wanted), 0, len(stamps_ns) - 1)])
 
 
-def view_at(reader: BagReader, stamp_ns: int) -> ThermalView | None:
-    """The frame of a stamp; None where the bag has none."""
+def view_at(reader: BagReader, stamp_ns: int, front_end: Tau2CameraConfig) -> ThermalView | None:
+    """The frame of a stamp, read with the parameters of its run; None where the bag has none."""
     first = next(reader.messages([reader.image_topic]), None)
     if first is None:
         return None
     # Offset between stamps and the recorder's clock, which may be years.
     apart = first.stamp_ns - stamp_to_ns(first.message.header.stamp)
     between = stamp_ns + apart - _BEFORE_NS, stamp_ns + apart + _AFTER_NS
-    for view in views(reader, between):
+    for view in views(reader, front_end, between):
         if view.stamp_ns == stamp_ns:
             return view
     return None
 
 
-def views(reader: BagReader, between_ns: tuple[int, int] | None = None) -> Iterator[ThermalView]:
+def views(
+    reader: BagReader, front_end: Tau2CameraConfig, between_ns: tuple[int, int] | None = None
+) -> Iterator[ThermalView]:
     """Frames of an open bag in false colours, in recorded order; ``between_ns``: of bag stamps."""
-    cleaner, scale = FrameCleaner(Tau2CameraConfig()), EightBitView(Tau2CameraConfig())
+    cleaner, scale = FrameCleaner(front_end), EightBitView(front_end)
     for item in reader.messages([reader.image_topic], between_ns):
         stamp = stamp_to_ns(item.message.header.stamp)
         clean = cleaner.process(stamp, image_to_array(item.message))

@@ -60,7 +60,7 @@ def draw_picture(evaluation: Evaluation, bag: Path, path: Path) -> None:
     """
     stamp_ns = _frame_to_show(evaluation)
     with BagReader(bag) as reader:
-        view = view_at(reader, stamp_ns)
+        view = view_at(reader, stamp_ns, evaluation.run.front_end)
     if view is None or view.pixels is None:
         raise InputError(f'{bag} has no frame of stamp {stamp_ns}')
     with matplotlib.rc_context(STYLE):

@@ -1,13 +1,14 @@
 """Reads a run folder into arrays."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from thermal_fiducial.config import from_mapping, Tau2CameraConfig
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
@@ -15,7 +16,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.plain_yaml import load_plain
-from thermal_fiducial.files.reading import is_there, one_line, read_text, require_folder
+from thermal_fiducial.files.reading import is_there, naming, one_line, read_text, require_folder
 from thermal_fiducial.files.writing import unfinished
 from thermal_fiducial.report.output_bag import read_output, RecordedOutput
 from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
@@ -60,6 +61,8 @@ class Run:
     true_map: MarkerMap | None = None
     #: t_imu - t_camera as configured
     offset_ns: int = 0
+    #: how the images were read
+    front_end: Tau2CameraConfig = field(default_factory=Tau2CameraConfig)
 
 
 def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None) -> Run:
@@ -102,6 +105,7 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
         truth_path=truth,
         true_map=None if true_map is None else load_map(true_map),
         offset_ns=offset_ns,
+        front_end=_front_end(path / PARAMETERS),
     )
 
 
@@ -135,11 +139,24 @@ def _camera_time_offset_ns(path: Path) -> int:
     """t_imu - t_camera that the filter was given."""
     if not path.exists():
         return 0
-    nodes = load_plain(path)
     try:
-        return round(float(nodes['/pose_ekf']['ros__parameters']['camera_time_offset']) * SECOND_NS)
+        return round(float(_parameters_of('pose_ekf', path)['camera_time_offset']) * SECOND_NS)
     except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(f'{path}: no camera_time_offset of pose_ekf in it') from None
+
+
+def _front_end(path: Path) -> Tau2CameraConfig:
+    """Parameters with which the images were read; the defaults where they are unknown."""
+    with naming(path):
+        return from_mapping(Tau2CameraConfig, _parameters_of('tau2_camera', path) if path.exists() else {})
+
+
+def _parameters_of(node: str, path: Path) -> dict[str, Any]:
+    """Parameters of a node in a run's file; empty without a section of it."""
+    document = load_plain(path)
+    section = document.get(f'/{node}') if isinstance(document, dict) else None
+    values = section.get('ros__parameters') if isinstance(section, dict) else None
+    return values if isinstance(values, dict) else {}
 
 
 def read_summary(path: Path) -> dict[str, Any]:

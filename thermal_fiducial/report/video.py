@@ -78,7 +78,7 @@ def _captioned(run: Run, reader: BagReader) -> Iterator[_BgrPixels]:
     last: _BgrPixels | None = None
     start_ns: int | None = None
     closed = [(entry.start_ns, entry.end_ns) for entry in interruptions(run, None) if entry.is_shutter]
-    for view in views(reader):
+    for view in views(reader, run.front_end):
         start_ns = view.stamp_ns if start_ns is None else start_ns
         if view.pixels is not None:
             last = view.pixels

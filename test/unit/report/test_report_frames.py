@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support import small_bag
 from support.run_folders import write_poses
+import yaml
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.reprojection import marker_corners
@@ -80,6 +81,24 @@ def test_a_strip_shows_frames_with_their_markers(flight):
             x, y = np.rint(0.75 * (0.5 * (a + b))).astype(int)
             assert cyan[y - 2 : y + 3, x - 2 : x + 3].any()
     assert np.mean(cyan) < 0.05
+
+
+def test_pictures_are_made_with_the_parameters_of_the_run(flight, tmp_path):
+    """Flag bits were taken for counts, and little else was to be seen."""
+    shutil.copytree(flight / 'run', tmp_path / 'run')
+    parameters = {'/pose_ekf': {'camera_time_offset': 0.0}, '/tau2_camera': {'bits': 13}}
+    sections = {node: {'ros__parameters': values} for node, values in parameters.items()}
+    (tmp_path / 'run' / 'parameters.yaml').write_text(yaml.safe_dump(sections))
+    recording = small_bag.recording(SECONDS)
+    for index, (stamp, topic, message) in enumerate(recording.events):
+        if topic == IMAGE_TOPIC:
+            counts = message.data.view(np.uint16).copy()
+            counts[::4] |= 1 << 13
+            recording.events[index] = stamp, topic, small_bag.replaced(message, data=counts.view(np.uint8))
+    flagged = recording.write(tmp_path / 'flagged')
+    assert [p.uri for p in strip(read_run(tmp_path / 'run'), flagged)] == [
+        p.uri for p in strip(read_run(flight / 'run'))
+    ]
 
 
 def test_the_page_holds_the_strip(flight):
@@ -179,7 +198,7 @@ def test_the_video_calls_the_shutter_by_its_name(flight, monkeypatch):
     seen = [ThermalView(int(stamp), None if 3 < k < 7 or k == 9 else pixels, 'frozen' if 3 < k < 7 or k == 9 else '')
             for k, stamp in enumerate(stamps)]  # fmt: skip
     lines = []
-    monkeypatch.setattr(video, 'views', lambda reader: iter(seen))
+    monkeypatch.setattr(video, 'views', lambda reader, front_end: iter(seen))
     monkeypatch.setattr(video, 'interruptions', lambda run, errors: [closed])
     monkeypatch.setattr(video, 'write', lambda picture, text, place: lines.append(text))
     video.write_video(run, flight / 'shutter.mp4')
