@@ -14,6 +14,7 @@ from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.core.wording import number_of
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 from thermal_fiducial.report.run_folder import bag_of_run, bag_options, Detections, Run
@@ -54,7 +55,13 @@ def bag_of(run: Run, bag: Path | None = None) -> BagReader | None:
 
 
 def strip(run: Run, bag: Path | None = None) -> list[FramePicture]:
-    """Pictures at even intervals over the run; none if the bag is not found."""
+    """Pictures at even intervals over the run; none if the bag is not found.
+
+    Raises
+    ------
+    InputError
+        The bag was given and is of another flight.
+    """
     replayed = bag_of(run, bag)
     stamps = run.detections.stamps_ns
     if replayed is None or not len(stamps):
@@ -62,6 +69,8 @@ def strip(run: Run, bag: Path | None = None) -> list[FramePicture]:
     start = int(stamps[0])
     pictures = []
     with replayed as reader:
+        if bag is not None:
+            refuse_other_flight(run, reader)
         for wanted in _even(np.unique(stamps)):
             view = view_at(reader, int(wanted), run.front_end)
             if view is not None and view.pixels is not None:
@@ -70,6 +79,19 @@ def strip(run: Run, bag: Path | None = None) -> list[FramePicture]:
                 seconds = (view.stamp_ns - start) / SECOND_NS
                 pictures.append(FramePicture(_uri(drawn), f'{seconds:.1f} s, {number_of(count, "marker")}'))
     return pictures
+
+
+def refuse_other_flight(run: Run, reader: BagReader) -> None:
+    """Raise InputError for a bag without a single one of the frames in which the run found markers."""
+    stamps = np.unique(run.detections.stamps_ns)
+    if not len(stamps) or any(view_at(reader, int(stamp), run.front_end) for stamp in _even(stamps)):
+        return
+    first = next(reader.messages([reader.image_topic]), None)
+    if first is None:
+        raise InputError(f'{reader.path}: no images on {reader.image_topic} in it')
+    images, markers = (stamp / SECOND_NS for stamp in (stamp_to_ns(first.message.header.stamp), int(stamps[0])))
+    begins = f'its images begin at {images:.1f} s, the markers of the run at {markers:.1f} s'
+    raise InputError(f'{reader.path}: not the bag of run {run.path}, as it has none of its frames; {begins}')
 
 
 def _even(stamps_ns: IntArray) -> IntArray:

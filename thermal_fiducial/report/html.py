@@ -94,7 +94,9 @@ def report_page(evaluation: Evaluation, numbers: dict[str, Any], pictures: list[
     def some(*names: str) -> tuple[Table, ...]:
         return tuple(made[name] for name in names if name in made)
 
-    no_bag = '' if pictures else 'No frames are shown: the bag is not where it was (--bag names it).'
+    no_bag = (
+        '' if pictures else 'No frames are shown: the bag is not where it was (--bag names it), or it has none of them.'
+    )
     sections = (
         Section(
             'errors',

@@ -87,7 +87,7 @@ def write_page(evaluation: Evaluation, numbers: dict[str, Any], bag: Path | None
     Raises
     ------
     InputError
-        The file cannot be written, or the plot libraries (extra ``tools``) are missing.
+        The file cannot be written, the plot libraries (extra ``tools``) are missing, or the bag is of another flight.
     """
     require_packages()
     from thermal_fiducial.report.frames import strip

@@ -13,7 +13,7 @@ from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.packages import is_installed
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import new_file
-from thermal_fiducial.report.frames import annotated, bag_of, views, write
+from thermal_fiducial.report.frames import annotated, bag_of, refuse_other_flight, views, write
 from thermal_fiducial.report.interruptions import Cause, interruptions
 from thermal_fiducial.report.run_folder import Run
 
@@ -47,13 +47,14 @@ def write_video(
     Raises
     ------
     InputError
-        No encoder, no bag, or a file that cannot be written.
+        No encoder, no bag or that of another flight, or a file that cannot be written.
     """
     require_encoder()
     replayed = bag_of(run, bag)
     if replayed is None:
         raise InputError(f'{run.path}: no video: the bag is not where it was (--bag names it)')
     with replayed as reader:
+        refuse_other_flight(run, reader)
         count = max(1, reader.message_count([reader.image_topic]))
         rate = _rate(reader, count)
         frames = _captioned(run, reader)

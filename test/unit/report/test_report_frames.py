@@ -131,6 +131,32 @@ def test_a_missing_bag_is_reported_and_another_path_can_be_given(flight, tmp_pat
     assert '--bag names it' in capsys.readouterr().err
 
 
+def later(message):
+    """The same image, 1000 s later."""
+    stamp_ns = stamp_to_ns(message.header.stamp) + 10**12
+    return small_bag.replaced(message, header=small_bag.header(stamp_ns, message.header.frame_id))
+
+
+@needs_encoder
+def test_the_bag_of_another_flight_is_refused(flight, tmp_path, capsys):
+    """The page had no frames and asked for --bag; the video showed the other flight."""
+    shutil.copytree(flight / 'run', tmp_path / 'run')
+    recording = small_bag.recording(SECONDS)
+    bags = {'later': recording.changed(IMAGE_TOPIC, later), 'blind': recording.without(IMAGE_TOPIC)}
+    words = {
+        'later': 'none of its frames; its images begin at 1700001000.0 s, the markers of the run at 1700000000.0 s',
+        'blind': 'no images on thermal/image_raw in it',
+    }
+    for name, made in bags.items():
+        bag = made.write(tmp_path / name)
+        for options in ([], ['--video', '--no-report']):
+            assert main(['evaluate', str(tmp_path / 'run'), '--bag', str(bag), *options]) == 2
+            assert words[name] in capsys.readouterr().err
+    # What was recorded as the bag of the run may have been replaced since, or have no images.
+    (tmp_path / 'run' / 'summary.json').write_text(json.dumps({'bag_path': str(tmp_path / 'blind')}))
+    assert strip(read_run(tmp_path / 'run')) == []
+
+
 def test_a_bag_beside_a_moved_run_is_found(flight, tmp_path):
     shutil.copytree(flight / 'run', tmp_path / 'run')
     (tmp_path / 'run' / 'summary.json').write_text(json.dumps({'bag': 'bag', 'bag_path': '/nowhere'}))
