@@ -30,6 +30,11 @@ TRUTH_HOLE_NS = 200_000_000
 #: 95 % quantile of chi-square by degrees of freedom; two-sided 95 % interval for a pose.
 CHI2_95 = {3: 7.815, 6: 12.592}
 CHI2_BAND_6 = (1.237, 14.449)
+#: Units beside the metre that trackers write positions in, and how many of them are a metre.
+_OTHER_UNITS = {'millimetres': 1e3, 'centimetres': 1e2}
+#: Largest rms residual, as a share of the path's extent, with which a truth in another unit fits the run. A truth in
+#: metres leaves 0.99 or more, a run that is usable at all hardly a tenth.
+_RESIDUAL_OF_UNIT = 0.2
 
 
 def interpolate(truth: Trajectory, stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
@@ -119,6 +124,19 @@ def rms(values: FloatArray) -> float:
 def aligned_residuals(e: Errors) -> FloatArray:
     """Position residuals (N, 3) [m] after the best rigid alignment of the estimate to the truth (no scale)."""
     return rigid_residuals(e.estimate[:, :3, 3], e.truth[:, :3, 3])
+
+
+def other_unit(e: Errors) -> tuple[str, float]:
+    """Unit of the truth's positions in which they fit the run, and how many of it are a metre; '', 1: metres.
+
+    ``e`` has at least one pose.
+    """
+    p_hat, p_true = e.estimate[:, :3, 3], e.truth[:, :3, 3]
+    extent = rms(np.linalg.norm(p_hat - p_hat.mean(axis=0), axis=1))
+    for unit, count in _OTHER_UNITS.items():
+        if rms(np.linalg.norm(rigid_residuals(p_hat, p_true / count), axis=1)) < _RESIDUAL_OF_UNIT * extent:
+            return unit, count
+    return '', 1.0
 
 
 def rigid_residuals(p_hat: FloatArray, p_true: FloatArray) -> FloatArray:

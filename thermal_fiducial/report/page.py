@@ -7,9 +7,10 @@ from typing import Any
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.packages import is_installed
+from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import evaluate, Evaluation
-from thermal_fiducial.report.metrics import TRUTH_HOLE_NS
+from thermal_fiducial.report.metrics import Errors, other_unit, TRUTH_HOLE_NS
 from thermal_fiducial.report.run_folder import read_run, SUMMARY
 from thermal_fiducial.report.trajectory import Trajectory
 
@@ -46,21 +47,27 @@ def evaluate_run(
     Raises
     ------
     InputError
-        No run folder, a broken file in it, or truth that doesn't cover the run.
+        No run folder, a broken file in it, or truth that doesn't cover the run or is not in metres.
     """
     evaluation = evaluate(read_run(Path(run_dir), truth, true_map))
     run = evaluation.run
-    if (
-        run.truth is not None
-        and len(run.fused)
-        and evaluation.fused_errors is not None
-        and not len(evaluation.fused_errors)
-    ):
-        raise InputError(f'{run.truth_path}: {_why_without_errors(run.truth, run.fused, run_dir)}')
+    if run.truth is not None and evaluation.fused_errors is not None and len(run.fused):
+        with naming(str(run.truth_path)):
+            _refuse_unusable(run.truth, evaluation.fused_errors, run.fused, run_dir)
     numbers = evaluation.numbers()
     text = json.dumps(run.summary | {'evaluation': numbers}, indent=2)
     write_text(Path(run_dir) / SUMMARY, text + '\n')
     return evaluation, numbers
+
+
+def _refuse_unusable(truth: Trajectory, errors: Errors, fused: Trajectory, run_dir: Path) -> None:
+    """Raise InputError for a truth without a pose at any of the run's, and for positions that are not in metres."""
+    if not len(errors):
+        raise InputError(_why_without_errors(truth, fused, run_dir))
+    unit, count = other_unit(errors)
+    if unit:
+        scale = f'positions of the ground truth are {count:g} times those of run {run_dir}'
+        raise InputError(f'{scale}: they seem to be in {unit}, and must be in metres')
 
 
 def _why_without_errors(truth: Trajectory, fused: Trajectory, run_dir: Path) -> str:

@@ -6,19 +6,22 @@ import json
 
 import numpy as np
 import pytest
-from support.run_folders import FIDUCIAL_SIGMA, FUSED_SIGMA, make_run, wall, write_truth_bag
+from support.run_folders import FIDUCIAL_SIGMA, FUSED_SIGMA, make_run, trajectory, wall, write_truth_bag
 import yaml
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import save_map
+from thermal_fiducial.files.trajectory_file import load_tum, save_tum
 from thermal_fiducial.report.evaluation import evaluate
+from thermal_fiducial.report.metrics import errors, other_unit
 from thermal_fiducial.report.overview import cards
 from thermal_fiducial.report.page import evaluate_run, write_page
 from thermal_fiducial.report.run_folder import read_run
 from thermal_fiducial.report.table import number
 from thermal_fiducial.report.tables import tables
+from thermal_fiducial.report.trajectory import Trajectory
 from thermal_fiducial.report.verdict import judge, Weight
 
 pytest.importorskip('plotly')
@@ -225,6 +228,28 @@ def test_truth_that_is_too_sparse_is_not_called_one_of_another_time(small_run, c
     error = capsys.readouterr().err
     assert 'poses of the ground truth are more than 0.2 s apart' in error
     assert 'no time in common' not in error
+
+
+@pytest.mark.parametrize(('unit', 'count'), [('millimetres', 1000), ('centimetres', 100)])
+def test_truth_that_is_not_in_metres_is_refused(small_run, capsys, unit, count):
+    """Of a tracker that writes millimetres: the errors were those of the unit, and nothing said so."""
+    truth = small_run / 'truth.tum'
+    stamps, positions, quaternions = load_tum(truth)
+    # The tracker's axes need not be those of the map.
+    save_tum(truth, stamps.tolist(), count * (positions[:, [1, 2, 0]] + 3.0), quaternions)
+    assert main(['evaluate', str(small_run)]) == 2
+    error = capsys.readouterr().err
+    assert f'{truth}: positions of the ground truth are {count} times those of run {small_run}' in error
+    assert f'they seem to be in {unit}, and must be in metres' in error
+
+
+@pytest.mark.parametrize('scale', [0.0, 1e-4, 0.3, 1.0, 3.0, 100.0])
+def test_a_bad_run_is_not_a_truth_in_another_unit(scale):
+    """Whether it stands or flies off."""
+    truth = trajectory(100.0)
+    poses = truth.T_map_body.copy()
+    poses[:, :3, 3] *= scale
+    assert other_unit(errors(Trajectory(truth.stamps_ns, poses), truth)) == ('', 1.0)
 
 
 @pytest.mark.parametrize(('count', 'words'), [(0, 'no pose'), (1, '1 pose'), (2, '2 poses')])
