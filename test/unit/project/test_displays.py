@@ -217,6 +217,16 @@ def test_rviz_shows_published_topics(published):
     assert topics <= published
 
 
+def test_rviz_hears_what_is_latched():
+    """A volatile subscriber that comes after the map and its cloud were published gets neither."""
+    displays = yaml.safe_load(RVIZ.read_text())['Visualization Manager']['Displays']
+    latched = [
+        entry['Topic'] for entry in displays if entry.get('Topic', {}).get('Value', '').startswith('marker_map/')
+    ]
+    assert [topic['Value'] for topic in latched] == ['marker_map/markers', 'marker_map/cloud']
+    assert {topic['Durability Policy'] for topic in latched} == {'Transient Local'}
+
+
 def test_both_are_installed(monkeypatch):
     given = {}
     monkeypatch.chdir(ROOT)

@@ -253,4 +253,5 @@ def test_flight_controllers_get_their_output(launched, file, parameters, remappi
 def test_the_view_shows_what_the_nodes_publish():
     view = yaml.safe_load((ROOT / 'config' / 'thermal_fiducial.rviz').read_text())
     topics = {display['Topic']['Value'] for display in view['Visualization Manager']['Displays'] if 'Topic' in display}
-    assert topics == {'marker_map/markers', 'odometry', 'path', 'camera_pose', 'thermal/image_markers'}
+    in_space = {'marker_map/markers', 'marker_map/cloud', 'odometry', 'path', 'camera_pose'}
+    assert topics == {*in_space, 'thermal/image_markers'}
