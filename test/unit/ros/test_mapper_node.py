@@ -25,7 +25,7 @@ from thermal_fiducial.files.records import camera
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import ERROR, WARN
-from thermal_fiducial.ros.messages import clouds, convert
+from thermal_fiducial.ros.messages import clouds, convert, display
 
 pytestmark = pytest.mark.ros
 
@@ -136,6 +136,18 @@ def test_a_cloud_that_cannot_be_read_is_a_fault(graph, tmp_path, map_file):
     assert 'none.ply' in reason
 
 
+@pytest.mark.parametrize('in_view', [False, True])
+def test_a_marker_in_quarantine_is_red_whether_it_is_in_view_or_not(in_view):
+    """One in view looked like all others in view, which were red."""
+    markers = {i: MapMarker(i, 0.3, True, transform(np.eye(3), [i, 0.0, 0.0]), trusted=i != 1) for i in range(2)}
+    rows = MarkerMap(markers).rows(frozenset(markers) if in_view else frozenset())
+    drawn = display.map_markers(rows, convert.header(0, 'map'))
+    good, bad = (marker.color for marker in drawn.markers if marker.ns == 'plates')
+    assert bad.r > 2.0 * bad.g
+    assert (good.g > 2.0 * good.r) == in_view
+    assert good.r <= good.g
+
+
 def test_each_drawing_of_the_map_is_complete(graph, tmp_path, monkeypatch):
     """Of a recorded flight, Foxglove showed those markers alone that had changed colour last before where it began."""
     path = tmp_path / 'map.yaml'
@@ -155,8 +167,8 @@ def test_each_drawing_of_the_map_is_complete(graph, tmp_path, monkeypatch):
     graph.send('markers', clouds.cloud(np.zeros(0, MARKER_DTYPE), convert.header(1, 'camera')))
     graph.diagnose(node)
     graph.spin_until(lambda: len(heard) == 3)
-    red = {m.id: m.color.r > 0.5 for m in heard[2].markers if m.ns == 'plates'}
-    assert red == {0: False, 1: True, 2: False}
+    green = {m.id: m.color.g > m.color.r for m in heard[2].markers if m.ns == 'plates'}
+    assert green == {0: False, 1: True, 2: False}
     assert [m.text for m in heard[2].markers if m.ns == 'ids'] == ['0', '1', '2']
     assert heard[2].markers[0].action == Marker.DELETEALL
     assert {m.header.stamp.nanosec for m in heard[2].markers} == {1}

@@ -12,9 +12,10 @@ from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import Gray
 from thermal_fiducial.ros.messages import convert
 
-_IN_VIEW = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.9)
-_OUT_OF_VIEW = ColorRGBA(r=0.1, g=0.7, b=0.1, a=0.9)
-_DISTRUSTED = ColorRGBA(r=0.5, g=0.5, b=0.5, a=0.5)
+# As pilots read them, and as ``watch`` has them: red is a fault. A marker that is out of view is none.
+_IN_VIEW = ColorRGBA(r=0.1, g=0.7, b=0.1, a=0.9)
+_OUT_OF_VIEW = ColorRGBA(r=0.5, g=0.5, b=0.5, a=0.9)
+_DISTRUSTED = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.9)
 _THICKNESS = 0.01
 _BGR_EDGE = (0, 0, 255)
 _BGR_FIRST_CORNER = (0, 255, 255)
@@ -47,8 +48,8 @@ def _plate(row: Any, head: Header) -> Marker:
 
 
 def _colour(row: Any) -> ColorRGBA:
-    """Red in view, green out of view, grey if distrusted."""
-    return _IN_VIEW if row['in_view'] else _OUT_OF_VIEW if row['trusted'] else _DISTRUSTED
+    """Red if distrusted, in view or not; else green in view, grey out of view."""
+    return _DISTRUSTED if not row['trusted'] else _IN_VIEW if row['in_view'] else _OUT_OF_VIEW
 
 
 def _label(row: Any, head: Header) -> Marker:
