@@ -27,7 +27,7 @@ from thermal_fiducial.core.mapping.located import Location, Reprojected, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE
 from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
 from thermal_fiducial.core.two_poses import DECISIVE
-from thermal_fiducial.core.types import FloatArray, TINY
+from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
 #: Extent of the markers in view [rad] beyond which perspective resolves the planar ambiguity.
 WIDE = np.deg2rad(25.0)
@@ -208,10 +208,10 @@ class JointFit:
     def alternative(self, found: Location, hypotheses: FloatArray) -> Alternative | None:
         """The second solution of the planar ambiguity; where it merges with the first, the likeliest pose far from it.
 
-        None if the corners rule it out.
+        None if the corners rule it out, or the markers would be smaller than a pixel from there.
         """
         T = found.pose.T_map_camera
-        apart = rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE
+        apart = (rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE) & self._shown_from(hypotheses)
         heavy = found.weights >= _HEAVY * found.weights.max()
         extent = np.ptp(self.sight.observed.corners[heavy], axis=(0, 1)) / self.camera.focal_px
         if math.hypot(*extent) > WIDE or not np.any(apart):
@@ -219,13 +219,21 @@ class JointFit:
         starts, weights = hypotheses[apart], found.weights * decision_weights(self.sight.noise_px, self.model)
         (T, other), chi2, _ = self.fit.solve(np.stack([T, starts[0]]), weights, inlier=np.inf)
         scale = noise_factor(float(chi2[0]), 8 * len(weights) - 6)
-        if rotation_angle(T[:3, :3].T @ other[:3, :3]) > SAME_POSE:
+        if rotation_angle(T[:3, :3].T @ other[:3, :3]) > SAME_POSE and self._shown_from(other):
             excess = float(chi2[1] - chi2[0]) / scale
             return None if excess > DECISIVE else Alternative(other, excess, is_minimum=True)
         turns = rotation_angle(T[:3, :3].T @ starts[:, :3, :3])
         excesses = np.maximum(self.fit.costs(starts, weights, inlier=np.inf) - chi2[0], 0.0) / scale
         far = int(np.argmax(turns**2 * np.exp(-0.5 * excesses)))
         return None if excesses[far] > DECISIVE else Alternative(starts[far], float(excesses[far]), is_minimum=False)
+
+    def _shown_from(self, T_map_camera: FloatArray) -> BoolArray:
+        """Whether cameras (..., 4, 4) show all markers larger than a pixel.
+
+        Where corners are noisier than their marker is large, a pose endlessly far away fits them, too.
+        """
+        distances = np.linalg.norm(self.sight.T_map_marker[:, :3, 3] - T_map_camera[..., None, :3, 3], axis=-1)
+        return np.asarray((distances < self.sight.sizes * self.camera.focal_px).all(axis=-1))
 
     def map_weights(self, T_map_camera: FloatArray) -> FloatArray:
         """Weights (N,) of the markers by their covariances in the map."""

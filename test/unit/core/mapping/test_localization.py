@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.walls import CAMERA, flight, look, see, SIZE, wall
+from support.walls import CAMERA, flight, look, rows, see, SIZE, wall
 
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
@@ -278,6 +278,19 @@ def test_no_camera_is_likeliest_endlessly_far_away():
     poses, T = look_at_one(rng, [-3.0, 0.2, 0.0])
     frame, start = joint_fit_of(poses, see(T, poses, 0.3, rng)), look([-1e9, 2e8, 0.0], poses[0][:3, 3])
     assert frame.likeliest(start, known_to(T, 3.0, 1.0), np.ones(1)) is None
+
+
+def test_no_alternative_is_endlessly_far_away():
+    """Corners of 5 px, on a marker that is hardly larger, do not rule it out; it was 800,000 km away."""
+    wide = Camera(640, 512, np.array([[170.0, 0.0, 319.5], [0.0, 170.0, 255.5], [0.0, 0.0, 1.0]]), 'equidistant')
+    corners = np.array(
+        [[[315.18634, 255.25053], [320.68295, 246.60187], [322.86435, 261.91904], [326.92624, 259.15503]]]
+    )
+    marker_map = MarkerMap({0: MapMarker(0, SIZE, True, wall(np.random.default_rng(0))[0])})
+    sight = Sight.of(Observations.of(rows([0], corners, 5.0, camera=wide)), marker_map)
+    assert np.linalg.norm(sight.observed.branches[0, 1, :3, 3]) > 1e6
+    # A marker of 0.3 m is as large as a pixel from 51 m on: the square of that, and a third for the fit's own.
+    assert locate(0, sight, wide, MODEL).pose.covariance.diagonal().max() < 1.33 * 51.0**2
 
 
 def test_a_fit_that_diverges_is_none():
