@@ -8,7 +8,7 @@ about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that t
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from operator import index
-from typing import TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
@@ -183,22 +183,38 @@ class Observations(Stacked):
         return observations if usable.all() else observations.only(usable)
 
 
+#: Kinds of numpy's types that are real numbers: floating-point, integers with and without sign.
+_REAL_NUMBERS = 'fiu'
 _IMU_SHAPES = {'angular_velocity': (3,), 'linear_acceleration': (3,)}
 _POSE_SHAPES = {'T_map_camera': (4, 4), 'covariance': (6, 6), 'map_covariance': (6, 6)}
 
 
-def _check(record: 'ImuSample | CameraPose', shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raise InputError if arrays of a ``record`` have other ``shapes``, or its stamp is not in whole nanoseconds."""
+def whole_ns(stamp_ns: Any, what: str) -> int:
+    """A stamp of ``what`` as an integer.
+
+    Raises
+    ------
+    InputError
+        It is none, as one in seconds.
+    """
     try:
         # Differences of numpy's unsigned integers would never be negative.
-        object.__setattr__(record, 'stamp_ns', index(record.stamp_ns))
+        return index(stamp_ns)
     except TypeError:
-        words = f'{type(record).__name__}: stamp_ns {record.stamp_ns!r} is not an integer of nanoseconds'
-        raise InputError(words) from None
+        raise InputError(f'{what}: stamp_ns {stamp_ns!r} is not an integer of nanoseconds') from None
+
+
+def _check(record: 'ImuSample | CameraPose', shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise InputError if arrays of a ``record`` are not numbers of ``shapes``, or its stamp is not an integer."""
+    kind = type(record).__name__
+    object.__setattr__(record, 'stamp_ns', whole_ns(record.stamp_ns, kind))
     for name, shape in shapes.items():
-        if getattr(getattr(record, name), 'shape', None) != shape:
-            found = f'is a {type(value := getattr(record, name)).__name__} of shape {np.shape(value)}'
-            raise InputError(f'{type(record).__name__}: {name} {found}, not a numpy array of shape {shape}')
+        value = getattr(record, name)
+        if getattr(value, 'shape', None) != shape:
+            found = f'is a {type(value).__name__} of shape {np.shape(value)}'
+            raise InputError(f'{kind}: {name} {found}, not a numpy array of shape {shape}')
+        if value.dtype.kind not in _REAL_NUMBERS:
+            raise InputError(f'{kind}: {name} is an array of {value.dtype}, not of real numbers')
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +224,7 @@ class ImuSample:
     Raises
     ------
     InputError
-        A stamp that is not an integer, or an array of another shape.
+        A stamp that is not an integer, or an array of another shape or not of numbers.
     """
 
     stamp_ns: int
@@ -228,7 +244,7 @@ class CameraPose:
     Raises
     ------
     InputError
-        A stamp that is not an integer, or an array of another shape.
+        A stamp that is not an integer, or an array of another shape or not of numbers.
     """
 
     stamp_ns: int

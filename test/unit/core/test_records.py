@@ -82,9 +82,16 @@ def test_no_stage_changes_what_it_received_or_has_handed_on():
         (CameraPose, (0, np.zeros(7), np.eye(6)), r'T_map_camera is a ndarray of shape \(7,\)'),
         (CameraPose, (0, np.eye(4), np.ones(36)), r'CameraPose: covariance is a ndarray of shape \(36,\), not'),
         (CameraPose, (0, np.eye(4), np.eye(6), np.eye(3)), 'map_covariance'),
+        (
+            ImuSample,
+            (0, np.array(['a', 'b', 'c']), np.zeros(3)),
+            'angular_velocity is an array of <U1, not of real numbers',
+        ),
+        (ImuSample, (0, np.zeros(3), np.zeros(3, complex)), 'linear_acceleration is an array of complex128, not of'),
+        (CameraPose, (0, np.full((4, 4), None), np.eye(6)), 'T_map_camera is an array of object, not of real numbers'),
     ],
 )
-def test_a_record_of_other_shapes_or_units_of_time_is_refused(kind, values, words):
+def test_a_record_of_other_shapes_kinds_or_units_of_time_is_refused(kind, values, words):
     with pytest.raises(InputError, match=words):
         kind(*values)
 
