@@ -156,7 +156,7 @@ def _numbers(value: Value, size: int, limit: float = np.inf) -> FloatArray:
 def _rigid(value: Value) -> FloatArray:
     """A rigid transform (4, 4) from 16 numbers, nested or not."""
     T = _numbers(value, 16, LARGEST_COORDINATE).reshape(4, 4)
-    if not is_rigid(T) or not np.allclose(T[3], (0, 0, 0, 1)):
+    if not is_rigid(T):
         raise value.error('no rigid transform')
     return T
 

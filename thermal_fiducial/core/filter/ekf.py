@@ -15,7 +15,7 @@ from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
 from thermal_fiducial.core.filter.output import condition_of, figures_of, in_corrected_map, odometry
 from thermal_fiducial.core.filter.propagation import usable_seconds
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
-from thermal_fiducial.core.geometry.plausibility import checked_covariance, is_rigid
+from thermal_fiducial.core.geometry.plausibility import checked_covariance, require_pose
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, Condition, ImuSample, in_moved_map, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
@@ -125,10 +125,11 @@ class PoseEkf:
         """Why a pose cannot be used; empty if it can. It may take the place of poses with other stamps."""
         if self._history.main is None and self._camera_clock.in_question:
             return CLOCK_JUMPED
-        if not is_rigid(pose.T_map_camera):
-            return 'refused: no finite rotation and translation'
         try:
+            require_pose(pose.T_map_camera, 'camera pose')
             checked_covariance(pose.covariance, 'covariance')
+            checked_covariance(pose.map_covariance, 'map_covariance', partial=True)
+            checked_covariance(pose.covariance - pose.map_covariance, 'covariance without map_covariance', partial=True)
         except InputError as error:
             return f'refused: {error}'
         return self._history.untimely(pose, instead_of)

@@ -69,8 +69,19 @@ def checked_covariance(values: FloatArray, what: str, *, partial: bool = False) 
 
 def is_rigid(T: FloatArray) -> bool:
     """Whether ``T`` (4, 4) is finite, and a rotation with a translation: neither scaled nor mirrored."""
+    if not np.isfinite(T).all():
+        return False
     R = T[:3, :3]
-    return bool(np.isfinite(T).all() and np.abs(R @ R.T - np.eye(3)).max() < _ORTHONORMAL and np.linalg.det(R) > 0.0)
+    is_rotation = np.abs(R @ R.T - np.eye(3)).max() < _ORTHONORMAL and np.linalg.det(R) > 0.0
+    return bool(is_rotation and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0)))
+
+
+def require_pose(T: FloatArray, what: str) -> None:
+    """Raise InputError if ``T`` (4, 4) is no finite rotation and translation within the bounds of a map."""
+    if not is_rigid(T):
+        raise InputError(f'{what}: no finite rotation and translation')
+    if not np.abs(T[:3, 3]).max() < LARGEST_COORDINATE:
+        raise InputError(f'{what}: {np.abs(T[:3, 3]).max():.3g} m away')
 
 
 def require_image(image: Counts | Gray) -> None:

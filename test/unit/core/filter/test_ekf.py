@@ -266,6 +266,28 @@ def test_an_imu_without_a_usable_sample_leaves_no_pose_to_fly_on(short_flight, b
     assert not ekf.lost
 
 
+@pytest.mark.parametrize(
+    ('bad', 'words'),
+    [
+        (lambda C: {'map_covariance': np.full((6, 6), np.nan)}, 'map_covariance that is not finite'),
+        (lambda C: {'map_covariance': np.full((6, 6), np.inf)}, 'map_covariance that is not finite'),
+        (lambda C: {'map_covariance': -C}, 'map_covariance with a variance of -'),
+        (lambda C: {'map_covariance': 1.5 * C}, 'covariance without map_covariance with a variance of -'),
+        (lambda C: {'T_map_camera': transform(np.eye(3), [1e300, 0.0, 0.0])}, '1e+300 m away'),
+        (lambda C: {'T_map_camera': np.diag([1.0, 1.0, 1.0, 5.0])}, 'no finite rotation and translation'),
+    ],
+)
+def test_a_pose_of_impossible_numbers_is_refused(flown, short_flight, bad, words):
+    """Who calls the library has no messages, whose numbers are checked; these ended in errors of linear algebra."""
+    late = replace(short_flight.poses[-1], stamp_ns=short_flight.poses[0].stamp_ns + 2_650_000_000)
+    update = flown.add_pose(replace(late, **bad(late.covariance)))
+    assert not update.accepted
+    assert update.reason.startswith('refused: ')
+    assert words in update.reason
+    # All of an error may be of the map: such a pose reaches the gate.
+    assert np.isfinite(flown.add_pose(replace(late, map_covariance=late.covariance)).nis)
+
+
 def test_unusable_poses_are_refused_with_a_reason(short_flight, flown):
     ekf, flight = flown, short_flight
     pose = flight.poses[0]
