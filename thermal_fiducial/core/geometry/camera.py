@@ -42,6 +42,14 @@ _EYE, _STILL = np.eye(3), np.zeros(3)
 _SQUARE_PIXELS = 0.01
 
 
+def _numbers(what: str, values: npt.ArrayLike) -> FloatArray:
+    """``values`` as an array; InputError if they are no real numbers."""
+    try:
+        return np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f'{what} that is not of real numbers') from None
+
+
 @dataclass(frozen=True)
 class Camera:
     """Intrinsics of one camera.
@@ -56,8 +64,8 @@ class Camera:
     Raises
     ------
     InputError
-        Unknown model, wrong number of coefficients, or a K that can't be one (of another form, not finite, no focal
-        length).
+        Unknown model, wrong number of coefficients, no image size, or a K that can't be one (of another form, not
+        finite, no focal length).
     """
 
     width: int
@@ -67,8 +75,7 @@ class Camera:
     D: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        K = np.array(self.K, dtype=np.float64)
-        D = np.zeros(0) if self.D is None else np.array(self.D, dtype=np.float64).reshape(-1)
+        K, D = _numbers('camera matrix', self.K), _numbers('distortion', [] if self.D is None else self.D).reshape(-1)
         if self.model not in MODELS:
             raise InputError(f'distortion model {self.model!r} is not one of {", ".join(MODELS)}')
         count = len(MODELS[self.model])
@@ -81,7 +88,7 @@ class Camera:
             raise InputError('camera matrix without a focal length: the camera is not calibrated')
         if K[1, 0] != 0.0 or not np.array_equal(K[2], (0.0, 0.0, 1.0)) or not abs(K[0, 1]) < K[0, 0]:
             raise InputError('camera matrix that is not of the form fx s cx, 0 fy cy, 0 0 1')
-        if self.width <= 0 or self.height <= 0:
+        if not all(isinstance(side, (int, np.integer)) and side > 0 for side in (self.width, self.height)):
             raise InputError(f'image size {self.width}x{self.height} in the calibration')
         filled = np.zeros(count)
         filled[: len(D)] = D[:count]

@@ -218,6 +218,12 @@ def test_short_coefficients_are_filled_up():
         ((640, 512, np.full((3, 3), np.nan)), 'not calibrated'),
         ((640, 512, K, 'plumb_bob', [np.inf, 0, 0, 0, 0]), 'not calibrated'),
         ((0, 512, K), 'image size 0x512'),
+        ((640.5, 512, K), 'image size 640.5x512'),
+        (('640', 512, K), 'image size 640x512'),
+        ((640, 512, [[745.0, 0.0], [319.5]]), 'camera matrix that is not of real numbers'),
+        ((640, 512, np.full((3, 3), 'a')), 'camera matrix that is not of real numbers'),
+        ((640, 512, K, 'plumb_bob', ['-0.3 0.1']), 'distortion that is not of real numbers'),
+        ((640, 512, K, 'plumb_bob', [1j]), 'distortion that is not of real numbers'),
     ],
 )
 def test_what_is_no_calibration_is_refused(arguments, words):
