@@ -31,7 +31,7 @@ from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.mapping.keyframes import VIEWS
 from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.measurements import ImuSample, Markers, Odometry, places_of
+from thermal_fiducial.core.measurements import ImuSample, Markers, Odometry, places_of, whole_ns
 from thermal_fiducial.core.motion_prior import MotionPrior, possible
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
@@ -127,8 +127,9 @@ class Pipeline:
         Raises
         ------
         InputError
-            The calibration is of another image size.
+            The calibration is of another image size, the image is none, or its stamp is not an integer.
         """
+        stamp_ns = whole_ns(stamp_ns, 'image')
         frame = self.cleaner.process(stamp_ns, counts)
         if frame.counts is None or self.camera is None:
             return FrameResult(stamp_ns, withheld=frame.reason or 'no camera_info')

@@ -104,6 +104,16 @@ def test_stamps_may_be_any_integers_of_numpy(integer):
     assert ImuSample(integer(5), np.zeros(3), np.zeros(3)).stamp_ns + -7 == -2
 
 
+@pytest.mark.parametrize('stamp', [1.5, None, '1'])
+def test_images_have_stamps_of_whole_nanoseconds(stamp):
+    """Stamps in seconds were taken for nanoseconds: the velocity between two frames is beyond all bounds then."""
+    pipeline = Pipeline(PipelineConfig(), load_dictionary('DICT_4X4_50'), small_bag.map_of([0]), small_bag.CAMERA)
+    picture = np.full((512, 640), 7000, np.uint16)
+    for take in (pipeline.add_image, lambda stamp, counts: pipeline.detector.detect(stamp, counts, small_bag.CAMERA)):
+        with pytest.raises(InputError, match=f'image: stamp_ns {stamp!r} is not an integer of nanoseconds'):
+            take(stamp, picture)
+
+
 @pytest.mark.parametrize('markers', [[], np.zeros((4, 2)), np.zeros(2, MARKER_DTYPE).tolist()])
 def test_what_is_no_row_of_markers_is_refused(markers):
     with pytest.raises(InputError, match='no rows of MARKER_DTYPE'):

@@ -18,7 +18,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses, solve_marker_poses
 from thermal_fiducial.core.geometry.reprojection import corners_of_faces
-from thermal_fiducial.core.measurements import marker_rows, Markers
+from thermal_fiducial.core.measurements import marker_rows, Markers, whole_ns
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
@@ -80,8 +80,9 @@ class MarkerDetector:
         Raises
         ------
         InputError
-            The calibration is of another image size.
+            The calibration is of another image size, the image is none, or its stamp is not an integer.
         """
+        stamp_ns = whole_ns(stamp_ns, 'image')
         camera.require_size_of(counts)
         config, known, history = self.config, self._known, self._history
         prediction = predict_frame(stamp_ns, prior, history.track, config.time_offset_std)

@@ -50,6 +50,14 @@ class CleanFrame:
     late: bool = False
 
 
+def _pixels(listed: IntArray) -> IntArray:
+    """``listed`` as integers (N, 2)."""
+    pixels = np.asarray(listed)
+    if pixels.ndim != 2 or pixels.shape[1] != 2 or pixels.dtype.kind not in 'iu':
+        raise InputError(f'bad pixels are an array of {pixels.dtype} of shape {pixels.shape}, not integers (N, 2)')
+    return pixels.astype(np.int64)
+
+
 class FrameCleaner:
     """Cleans raw frames to counts of the scene at their stamp.
 
@@ -57,11 +65,16 @@ class FrameCleaner:
     ----------
     config : bits, bad pixels, settling
     bad_pixels : (N, 2) column, row of pixels known to be bad
+
+    Raises
+    ------
+    InputError
+        ``bad_pixels`` of another shape, or not of integers.
     """
 
     def __init__(self, config: Tau2CameraConfig, bad_pixels: IntArray | None = None) -> None:
         self.config = config
-        self._known_bad: IntArray = np.reshape([] if bad_pixels is None else bad_pixels, (-1, 2)).astype(np.int64)
+        self._known_bad = _pixels(np.zeros((0, 2), np.int64) if bad_pixels is None else bad_pixels)
         self._telemetry_on_top = 0
         #: shift of the counts; frames in a row that show carries into the bits that are masked otherwise, as those of a
         #: radiometric camera, which fills all 16: after a few of them frames without carries are believed too

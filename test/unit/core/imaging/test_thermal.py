@@ -58,6 +58,13 @@ def test_a_clean_frame_passes_untouched():
     assert not np.shares_memory(result.counts, frame)
 
 
+@pytest.mark.parametrize('listed', [np.array([[1.5, 2.5]]), np.zeros((2, 3), int), np.array([1, 2]), [['a', 'b']]])
+def test_what_is_no_list_of_bad_pixels_is_refused(listed):
+    """Fractions were cut off, and six numbers were three pixels."""
+    with pytest.raises(InputError, match=r'bad pixels are an array of .* of shape .*, not integers \(N, 2\)'):
+        Camera(bad_pixels=listed)
+
+
 def test_every_frame_says_that_a_listed_bad_pixel_is_outside():
     """Of a list for another camera."""
     camera = Camera(bad_pixels=np.array([[600, 500]]))
