@@ -12,6 +12,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from thermal_fiducial.core.geometry.plausibility import require_numbers
 from thermal_fiducial.core.geometry.reprojection import turned
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked
@@ -183,8 +184,6 @@ class Observations(Stacked):
         return observations if usable.all() else observations.only(usable)
 
 
-#: Kinds of numpy's types that are real numbers: floating-point, integers with and without sign.
-_REAL_NUMBERS = 'fiu'
 _IMU_SHAPES = {'angular_velocity': (3,), 'linear_acceleration': (3,)}
 _POSE_SHAPES = {'T_map_camera': (4, 4), 'covariance': (6, 6), 'map_covariance': (6, 6)}
 
@@ -209,12 +208,7 @@ def _check(record: 'ImuSample | CameraPose', shapes: Mapping[str, tuple[int, ...
     kind = type(record).__name__
     object.__setattr__(record, 'stamp_ns', whole_ns(record.stamp_ns, kind))
     for name, shape in shapes.items():
-        value = getattr(record, name)
-        if getattr(value, 'shape', None) != shape:
-            found = f'is a {type(value).__name__} of shape {np.shape(value)}'
-            raise InputError(f'{kind}: {name} {found}, not a numpy array of shape {shape}')
-        if value.dtype.kind not in _REAL_NUMBERS:
-            raise InputError(f'{kind}: {name} is an array of {value.dtype}, not of real numbers')
+        require_numbers(getattr(record, name), shape, f'{kind}: {name}')
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from thermal_fiducial.core.map_limits import fault_of_covariance, LARGEST_MARKER_M
 from thermal_fiducial.core.types import LARGEST_ID
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.schema import load_yaml, parse_yaml, Value
@@ -26,8 +27,6 @@ VERSION = 1
 # Written decimals: nanometres and nanoradians, below any measurement; and significant digits of covariances, whose
 # rounding must leave them positive definite: markers far from the anchor share nearly all of their errors.
 _DIGITS = 9
-# Tolerance of a covariance's symmetry and eigenvalues, relative to its largest element: rounding to six digits.
-_ROUNDING = 1e-6
 _MOST = 2**63 - 1
 _LARGEST_M = 1e5
 _SIMPLE = re.compile(r'[A-Za-z][A-Za-z0-9_./-]*')
@@ -179,19 +178,15 @@ def _count(value: Value) -> int:
 
 def _size(value: Value) -> float:
     size = value.number()
-    if not 0.0 < size < 100.0:
+    if not 0.0 < size < LARGEST_MARKER_M:
         raise value.error(f'{value.quoted()} is not a side in metres')
     return size
 
 
 def _covariance(value: Value) -> tuple[float, ...]:
     numbers = value.numbers(36, _LARGEST_M**2)
-    matrix = np.reshape(numbers, (6, 6))
-    scale = float(np.max(np.abs(matrix)))
-    if np.max(np.abs(matrix - matrix.T)) > _ROUNDING * scale:
-        raise value.error('not symmetric')
-    if np.linalg.eigvalsh(matrix)[0] < -_ROUNDING * scale:
-        raise value.error('has a negative variance')
+    if fault := fault_of_covariance(np.reshape(numbers, (6, 6))):
+        raise value.error(fault)
     return tuple(numbers)
 
 

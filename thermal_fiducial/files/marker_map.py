@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from thermal_fiducial.core.geometry.plausibility import require_side
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.errors import InputError
@@ -26,7 +27,8 @@ def load_map(
     Raises
     ------
     InputError
-        The file can't be read, is not a marker map, or has an invalid entry; the message names file and entry.
+        The file can't be read, is not a marker map, or has an invalid entry; the message names file and entry. Or a
+        side that was given is none.
     """
     document = read_document(str(path))
     sizes = size_overrides or {}
@@ -35,6 +37,8 @@ def load_map(
         size = sizes.get(entry.id, marker_size) if entry.size is None else entry.size
         if size is None:
             raise InputError(f'{path}: marker {entry.id} has no size, and no marker size was given')
+        if entry.size is None:
+            require_side(size, f'marker size for {path}')
         markers[entry.id] = _marker(entry, size)
     return MarkerMap(markers, document.frame_id, document.dictionary, document.revision)
 
@@ -54,6 +58,7 @@ def save_map(path: str | Path, marker_map: MarkerMap) -> None:
     InputError
         The folder doesn't exist or can't be written to, or the map has a value that the reader would refuse.
     """
+    marker_map.require_usable()
     write_text(path, dump_map(marker_map))
 
 

@@ -10,6 +10,7 @@ from thermal_fiducial.config import ImuNoise, parameters
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import is_rigid, LARGEST_COORDINATE, require_usable
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
+from thermal_fiducial.core.map_limits import LARGEST_MARKER_M
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import MODEL_SYNONYMS
@@ -25,7 +26,7 @@ NOISE_NAMES = (
 )
 #: Largest noise densities, as the nodes take them.
 _LARGEST_NOISE = {name: item.metadata['maximum'] for name, item, _ in parameters(ImuNoise) if name in NOISE_NAMES}
-_LONGEST_SIDE, LARGEST_MARKER_M, _LARGEST_OFFSET_S = 65_535, 100.0, 1.0
+_LONGEST_SIDE, _LARGEST_OFFSET_S = 65_535, 1.0
 #: Header of OpenCV in some of EuRoC's files, which YAML 1.1 does not allow.
 _OPENCV_HEAD = '%YAML:1.0'
 

@@ -1,6 +1,7 @@
 """Marker maps on disk: round trip, defaults, clear errors, and no map lost to a kill."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 import signal
 import subprocess
@@ -10,8 +11,10 @@ import time
 import numpy as np
 import pytest
 
+from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.se3 import skew, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.map_format import parse_document, upgraded
 from thermal_fiducial.files.marker_map import dump_map, load_map, save_map
@@ -217,9 +220,12 @@ def test_what_could_not_be_read_back_is_not_written(tmp_path, spoilt):
     before = path.read_bytes()
     bad = some_map()
     bad.markers[7] = replace(bad.markers[7], **spoilt)
-    with pytest.raises(InputError, match='not written'):
+    with pytest.raises(InputError, match='marker 7 of the map: '):
         save_map(path, bad)
     assert path.read_bytes() == before
+    # A mapper saves without that check.
+    with pytest.raises(InputError, match='not written'):
+        dump_map(bad)
 
 
 def test_a_symbolic_link_stays_one(tmp_path):
@@ -231,3 +237,48 @@ def test_a_symbolic_link_stays_one(tmp_path):
     assert link.is_symlink()
     assert load_map(tmp_path / 'maps' / 'real.yaml').revision == 9
     assert [entry.name for entry in (tmp_path / 'maps').iterdir()] == ['real.yaml']
+
+
+def entry(**fields):
+    return MapMarker(**({'id': 2, 'size': 0.3, 'fixed': False, 'T_map_marker': np.eye(4)} | fields))
+
+
+@pytest.mark.parametrize(
+    ('fields', 'words'),
+    [
+        ({'T_map_marker': np.full((4, 4), np.nan)}, 'no finite rotation and translation'),
+        ({'T_map_marker': 2.0 * np.eye(4)}, 'no finite rotation and translation'),
+        ({'T_map_marker': transform(np.eye(3), [0.0, 1e6, 0.0])}, '1e+06 m away'),
+        ({'T_map_marker': np.eye(3)}, 'T_map_marker is a ndarray of shape (3, 3), not a numpy array of shape (4, 4)'),
+        ({'T_map_marker': np.eye(4).tolist()}, 'T_map_marker is a list of shape (4, 4)'),
+        ({'size': 0.0}, '0.0 is not a side in metres'),
+        ({'size': np.nan}, 'nan is not a side in metres'),
+        ({'size': '0.3'}, "'0.3' is not a side in metres"),
+        ({'covariance': np.full((6, 6), np.nan)}, 'covariance: not finite, or too large'),
+        ({'covariance': -np.eye(6)}, 'covariance: has a negative variance'),
+        ({'covariance': np.triu(np.ones((6, 6)))}, 'covariance: not symmetric'),
+        ({'covariance': np.eye(3)}, 'covariance is a ndarray of shape (3, 3)'),
+        ({'id': 7}, 'ID 7'),
+    ],
+)
+def test_a_map_that_no_file_could_hold_is_refused(tmp_path, fields, words):
+    """A map that was made in a program: the camera was nowhere, or an error of linear algebra came frames later."""
+    marker_map = MarkerMap({2: entry(**fields)})
+    for use in (partial(MarkerMapper, MarkerMapperConfig()), partial(save_map, tmp_path / 'map.yaml')):
+        with pytest.raises(InputError) as caught:
+            use(marker_map)
+        assert str(caught.value).startswith('marker 2 of the map: ')
+        assert words in str(caught.value)
+    assert not (tmp_path / 'map.yaml').exists()
+
+
+@pytest.mark.parametrize('size', [0.0, -0.3, np.nan, '0.3'])
+def test_a_side_that_is_none_is_refused_where_the_file_leaves_it_out(tmp_path, size):
+    path = tmp_path / 'map.yaml'
+    save_map(path, MarkerMap({2: entry()}))
+    assert load_map(path, size).markers[2].size == 0.3
+    path.write_text(path.read_text().replace('size: 0.3, ', ''))
+    with pytest.raises(InputError, match=f'^marker size for {path}: .* is not a side in metres'):
+        load_map(path, size)
+    with pytest.raises(InputError, match='is not a side in metres'):
+        load_map(path, 0.3, {2: size})

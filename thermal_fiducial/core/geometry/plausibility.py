@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermal_fiducial.core.map_limits import LARGEST_MARKER_M
 from thermal_fiducial.core.types import Counts, FloatArray, Gray
 from thermal_fiducial.errors import InputError
 
@@ -19,6 +20,8 @@ LARGEST_COORDINATE = 1e5
 SMALLEST_VARIANCE, LARGEST_VARIANCE = 1e-20, 1e8
 #: Least share of a variance that the other components may leave unexplained; rounding takes less than a tenth of it.
 LEAST_INDEPENDENT = 1e-12
+#: Kinds of numpy's types that are real numbers: floating-point, integers with and without sign.
+_REAL_NUMBERS = 'fiu'
 #: Relative difference of entries that should be equal, by rounding of a few operations.
 _ROUNDING = 1e-9
 #: Added to variances that may be zero, before the check, beside that share of the largest one [m^2, rad^2].
@@ -82,6 +85,21 @@ def require_pose(T: FloatArray, what: str) -> None:
         raise InputError(f'{what}: no finite rotation and translation')
     if not np.abs(T[:3, 3]).max() < LARGEST_COORDINATE:
         raise InputError(f'{what}: {np.abs(T[:3, 3]).max():.3g} m away')
+
+
+def require_numbers(values: FloatArray, shape: tuple[int, ...], what: str) -> None:
+    """Raise InputError if ``values`` are no numpy array of real numbers in ``shape``."""
+    if getattr(values, 'shape', None) != shape:
+        found = f'is a {type(values).__name__} of shape {np.shape(values)}'
+        raise InputError(f'{what} {found}, not a numpy array of shape {shape}')
+    if values.dtype.kind not in _REAL_NUMBERS:
+        raise InputError(f'{what} is an array of {values.dtype}, not of real numbers')
+
+
+def require_side(size: object, what: str) -> None:
+    """Raise InputError if ``size`` is no side of a marker [m]."""
+    if not (isinstance(size, (int, float, np.floating)) and 0.0 < size < LARGEST_MARKER_M):
+        raise InputError(f'{what}: {size!r} is not a side in metres')
 
 
 def require_image(image: Counts | Gray) -> None:

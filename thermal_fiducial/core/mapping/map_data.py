@@ -13,10 +13,12 @@ from thermal_fiducial.core.error_model import (
     scale_of_map,
     SystematicErrors,
 )
+from thermal_fiducial.core.geometry.plausibility import require_numbers, require_pose, require_side
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.geometry.se3 import apply, quaternion_from_rotation, rigid_alignment
+from thermal_fiducial.core.map_limits import fault_of_covariance
 from thermal_fiducial.core.measurements import CameraPose, MAP_DTYPE
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, LARGEST_ID
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 
@@ -88,6 +90,25 @@ class MarkerMap:
     def size_in_words(self) -> str:
         """How many markers it has."""
         return number_of(len(self.markers), 'marker')
+
+    def require_usable(self) -> None:
+        """Check a map that was not read from a file.
+
+        Raises
+        ------
+        InputError
+            A marker under another ID than its own, or one whose pose, side or covariance is none.
+        """
+        for key, marker in self.markers.items():
+            what = f'marker {key!r} of the map'
+            if marker.id != key or not (isinstance(key, int) and 0 <= key <= LARGEST_ID):
+                raise InputError(f'{what}: ID {marker.id!r}')
+            require_side(marker.size, what)
+            require_numbers(marker.T_map_marker, (4, 4), f'{what}: T_map_marker')
+            require_numbers(marker.covariance, (6, 6), f'{what}: covariance')
+            require_pose(marker.T_map_marker, what)
+            if marker.covariance.any() and (fault := fault_of_covariance(marker.covariance)):
+                raise InputError(f'{what}: covariance: {fault}')
 
     def copy(self) -> 'MarkerMap':
         """A copy that shares the immutable markers."""

@@ -49,9 +49,15 @@ class MarkerMapper:
     ----------
     config : sizes, mode, extrinsics
     marker_map : the map to start from, with at least one marker; it is copied
+
+    Raises
+    ------
+    InputError
+        A marker of the map is unusable.
     """
 
     def __init__(self, config: MarkerMapperConfig, marker_map: MarkerMap) -> None:
+        marker_map.require_usable()
         self.configure(config)
         #: while True the map does not change but for its quarantine; ``config.mode`` gives the initial value
         self.frozen = config.mode == 'localization'
