@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.core.types import BoolArray, Counts, FloatArray, IntArray, SECOND_NS
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.sim.imu import ImuRecord
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.render import Quality, Renderer
@@ -16,6 +17,9 @@ from thermal_fiducial.sim.scene import Marker, Plate
 START_NS = 1_700_000_000_000_000_000
 #: Number of frames in a chunk. Each chunk begins with a warm-up, so that the bytes do not depend on the workers.
 CHUNK = 30
+
+#: Longest simulated flight [s].
+LONGEST_FLIGHT_S = 3_600.0
 
 _DEFAULT_QUALITY = Quality()
 # Distance from the image's border from which on a marker counts as wholly in it [px].
@@ -96,9 +100,20 @@ def plan(
     noise: bool = True,
     quality: Quality = _DEFAULT_QUALITY,
 ) -> FlightPlan:
-    """A flight of ``scenario`` (an object or a name), by default of the scenario's length."""
+    """A flight of ``scenario`` (an object or a name), by default of the scenario's length.
+
+    Raises
+    ------
+    InputError
+        No such scenario, a length that is none, or a seed that is no whole number from 0 on.
+    """
     chosen = named(scenario) if isinstance(scenario, str) else scenario
-    return FlightPlan(chosen, seconds or chosen.seconds, seed, noise, quality)
+    seconds = chosen.seconds if seconds is None else seconds
+    if not (isinstance(seconds, (int, float)) and 0.0 < seconds <= LONGEST_FLIGHT_S):
+        raise InputError(f'a flight of {seconds!r} s: it is to be longer than 0 s, and {LONGEST_FLIGHT_S:g} s at most')
+    if not (isinstance(seed, int) and seed >= 0):
+        raise InputError(f'seed {seed!r}: it is to be a whole number from 0 on')
+    return FlightPlan(chosen, seconds, seed, noise, quality)
 
 
 def render_frames(

@@ -63,7 +63,7 @@ def simulate(out: str | Path, scenario: Scenario | str = 'fog', seconds: float |
     Raises
     ------
     InputError
-        ``out`` exists or cannot be written, or there is no such scenario.
+        ``out`` exists or cannot be written, there is no such scenario, or ``seconds`` or ``seed`` are unusable.
     """
     folder = Path(out)
     write_flight(folder, plan(scenario, seconds, seed))

@@ -28,7 +28,7 @@ from thermal_fiducial.sim.corner_noise import CornerNoise
 from thermal_fiducial.sim.render import Quality
 from thermal_fiducial.sim.scenario import LENSES, SCENARIOS
 from thermal_fiducial.sim.thermal_camera import plan, render_frames, simulate_imu
-from thermal_fiducial.sim.writer import IMAGE_DELAY_NS, write_flight
+from thermal_fiducial.sim.writer import IMAGE_DELAY_NS, simulate, write_flight
 
 SECONDS = 2.0
 #: How finely a frame is sampled is nothing that a bag shows.
@@ -217,6 +217,24 @@ def test_nothing_is_left_of_a_failed_flight(tmp_path):
     with pytest.raises(InputError, match='dictionary'):
         write_flight(tmp_path / 'bag', plan(replace(TINY, dictionary='DICT_9X9'), SECONDS))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('given', 'words'),
+    [
+        ({'seconds': float('nan')}, 'a flight of nan s'),
+        ({'seconds': float('inf')}, 'a flight of inf s'),
+        ({'seconds': 0.0}, 'a flight of 0.0 s'),
+        ({'seconds': '20'}, "a flight of '20' s"),
+        ({'seed': -1}, 'seed -1'),
+        ({'seed': 1.5}, 'seed 1.5'),
+    ],
+)
+def test_a_flight_that_cannot_be_flown_is_refused(tmp_path, given, words):
+    """0 s was the scenario's own length, the others were errors of numpy."""
+    with pytest.raises(InputError, match=f'^{words}: it is to be'):
+        simulate(tmp_path / 'bag', TINY, **given)
+    assert not (tmp_path / 'bag').exists()
 
 
 def test_what_a_killed_simulation_has_left_is_removed_by_the_next_one(tmp_path):
