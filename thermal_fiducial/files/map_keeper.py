@@ -79,8 +79,6 @@ class MapKeeper:
     def take(self) -> None:
         """The map that was read last replaces the one before, which :meth:`put_aside` has kept if it was not saved."""
         self._read, self.unsaved = self._at_hand, False
-        if self._own_autosave:
-            self._retire_autosave()
 
     def recover(self, autosave_period: float) -> tuple[MarkerMap | None, str]:
         """The autosaved map of a mapper that has just crashed (or None), and a message about an autosave.
@@ -135,7 +133,11 @@ class MapKeeper:
         return self.path
 
     def put_aside(self, marker_map: MarkerMap) -> Path | None:
-        """Write a map that is about to be replaced beside its file; returns the written file, None if it was saved.
+        """Write a map that is about to be replaced beside its file, and remove its autosave.
+
+        Returns
+        -------
+        The written file; None if the map was saved.
 
         Raises
         ------
@@ -143,7 +145,10 @@ class MapKeeper:
             Nothing can be written anywhere.
         """
         self.obstacle = ''
-        return self._save_elsewhere(marker_map, 'replaced') if self.unsaved and marker_map.markers else None
+        aside = self._save_elsewhere(marker_map, 'replaced') if self.unsaved and marker_map.markers else None
+        if self._own_autosave:
+            self._retire_autosave()
+        return aside
 
     def _save_elsewhere(self, marker_map: MarkerMap, kind: str) -> Path:
         name = f'{self.path.stem}.{kind}{self.path.suffix}'

@@ -104,6 +104,7 @@ def test_a_map_that_a_load_has_discarded_does_not_come_back(path):
     keeper = keeper_of(path)
     autosaved(keeper, grown(2))
     keeper.read()
+    keeper.put_aside(grown(2))
     keeper.take()
     restarted = MapKeeper(path, 0.3, {})
     restarted.read()

@@ -5,19 +5,21 @@ import errno
 import multiprocessing
 import os
 import threading
+import time
 
 import pytest
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
 
 from thermal_fiducial.core.mapping.map_data import MapMarker, MapperResult, MarkerMap
-from thermal_fiducial.files.map_history import entries
+from thermal_fiducial.files.atomic import locked
+from thermal_fiducial.files.map_history import autosave_file, entries
 from thermal_fiducial.files.map_keeper import MapKeeper
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import ERROR, WARN
-from thermal_fiducial.ros.mapper_node import map_status
+from thermal_fiducial.ros.mapper_node import map_services, map_status
 
 pytestmark = pytest.mark.ros
 MODES = ('mapping', 'localization')
@@ -93,6 +95,31 @@ def test_what_is_found_while_a_disk_is_busy_is_saved_at_the_end(graph, map_file,
         graph.spin_until(lambda: entries(map_file))
     node.close()
     assert load_map(map_file).markers.keys() == {0, 7, 9}
+
+
+def test_a_load_holds_no_frame_up_for_another_programs_lock(graph, map_file, monkeypatch):
+    """Behind the limited wait it removed the autosave, and waited five seconds for the lock: no pose meanwhile."""
+    keepers = []
+
+    class Kept(MapKeeper):
+        def __init__(self, *arguments, **options):
+            super().__init__(*arguments, **options)
+            keepers.append(self)
+
+    monkeypatch.setattr(map_services, 'MapKeeper', Kept)
+    node, (keeper,) = graph.add(MarkerMapperNode, map_file=str(map_file), mode='mapping', autosave_period=0.0), keepers
+    # An autosave of a map that counts as saved, as while a save waits for its disk.
+    keeper.unsaved = True
+    keeper.autosave(node.mapper.map)
+    keeper.finish()
+    keeper.unsaved = False
+    with locked(map_file):
+        began = time.monotonic()
+        assert ask(graph, 'load') == (False, f'{map_file}: the disk is busy; this goes on without an answer')
+        # A second is the patience of services; another second for a busy machine.
+        assert time.monotonic() - began < 2.0
+    assert ask(graph, 'load')[0]
+    assert not autosave_file(map_file).exists()
 
 
 @pytest.mark.parametrize('name', ['load', 'undo'])
