@@ -74,6 +74,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         """Publish the diagnostics and the display of the map: only once a second, as a thousand markers take long."""
         super().diagnose(stamp_ns)
         self._topics.draw_for_listeners(self.mapper.map, self._result.in_view, self._result.stamp_ns)
+        self._map.remember()
 
     def state(self) -> tuple[bytes, str]:
         """Why the last frame gave no pose, doubts about map and file, quarantined markers, skipped frames."""

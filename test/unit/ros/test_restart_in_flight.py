@@ -1,16 +1,19 @@
-"""A filter that crashed in flight goes on with the clock offset that it knew last."""
+"""Nodes that crashed in flight go on: a filter with the clock offset that it knew last, a mapper frozen or free."""
 
 import json
+import multiprocessing
 import os
 import threading
 import time
 
 import pytest
+from std_srvs.srv import SetBool
 from support.messages import imu, pose
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.clock_offset import recent_clock_offset, save_clock_offset
+from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.ros.filter_node import filter_memory
 
@@ -105,6 +108,77 @@ def test_a_restarted_filter_begins_with_the_offset_of_the_one_before(tmp_path, m
     with ros_graph() as graph:
         graph.add(PoseEkfNode, live=True)
     assert 'started again' not in capfd.readouterr().err
+
+
+@pytest.fixture(autouse=True)
+def no_process_left():
+    """A mapper that is killed here has not ended its process of the refinements."""
+    yield
+    for process in multiprocessing.active_children():
+        process.kill()
+        process.join()
+
+
+def freeze(graph, frozen):
+    return graph.call(SetBool, 'marker_mapper/freeze', SetBool.Request(data=frozen)).message
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(('mode', 'frozen'), [('mapping', True), ('localization', False)])
+def test_a_restarted_mapper_is_frozen_or_free_as_the_one_before(tmp_path, map_file, monkeypatch, capfd, mode, frozen):
+    """A map that the pilot had frozen changed again after a crash, and nothing said so."""
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    start = {'live': True, 'map_file': str(map_file), 'mode': mode}
+    with ros_graph() as graph:
+        node = graph.add(MarkerMapperNode, **start)
+        freeze(graph, frozen)
+        node.diagnose(0)
+        graph.spin_until(lambda: list(tmp_path.rglob('marker_mapper*.json')))
+    # It was killed.
+    said = f'started again in flight: the map is {"frozen" if frozen else "free"} as before'
+    assert said not in capfd.readouterr().err
+    with ros_graph() as graph:
+        again = graph.add(MarkerMapperNode, **start)
+        assert again.mapper.frozen == frozen
+        assert said in capfd.readouterr().err
+        # For the next restart the file stays new.
+        (file,) = tmp_path.rglob('marker_mapper*.json')
+        os.utime(file, (0, 0))
+        again.diagnose(0)
+        graph.spin_until(lambda: file.stat().st_mtime > 0)
+        again.finish()
+        again.close()
+    with ros_graph() as graph:
+        assert graph.add(MarkerMapperNode, **start).mapper.frozen == (mode == 'localization')
+    assert said not in capfd.readouterr().err
+
+
+@pytest.mark.ros
+def test_a_mapper_that_nobody_has_frozen_leaves_no_file(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    with ros_graph() as graph:
+        node = graph.add(MarkerMapperNode, live=True)
+        node.diagnose(0)
+        node.finish()
+        node.close()
+    assert not list(tmp_path.rglob('*.json'))
+
+
+@pytest.mark.parametrize(
+    'text', ['', '{}', '[]', '{"frozen": true}', '{"format": "thermal_fiducial/freeze", "version": 1, "frozen": 1}']
+)
+@pytest.mark.ros
+def test_what_is_no_file_of_a_mapper_freezes_nothing(tmp_path, monkeypatch, text):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    with ros_graph() as graph:
+        node = graph.add(MarkerMapperNode, live=True)
+        freeze(graph, True)
+        node.diagnose(0)
+        graph.spin_until(lambda: list(tmp_path.rglob('marker_mapper*.json')))
+        (file,) = tmp_path.rglob('marker_mapper*.json')
+    file.write_text(text)
+    with ros_graph() as graph:
+        assert graph.add(MarkerMapperNode, live=True).mapper.frozen is False
 
 
 @pytest.mark.ros

@@ -19,6 +19,7 @@ from thermal_fiducial.files.map_keeper import MapKeeper
 from thermal_fiducial.files.marker_map import other_frame
 from thermal_fiducial.files.reading import is_there
 from thermal_fiducial.ros.base.node import Made, StageNode
+from thermal_fiducial.ros.mapper_node.freeze_memory import FreezeMemory
 from thermal_fiducial.ros.mapper_node.map_refinement import MapRefinement
 
 Answer = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
@@ -49,7 +50,9 @@ class MapServices:
         self._other_dictionary = ''
         #: the fault of a map file that could not be read at the start
         self._unread: list[str] = []
+        self._memory = FreezeMemory(node)
         self.mapper = MarkerMapper(config, self._first_map())
+        self.mapper.frozen = self._memory.recalled(self.mapper.frozen)
         self.refinement = MapRefinement(self.mapper, live=node.live)
         node.endings.append(self.close)
         node.completions.append(self._finish)
@@ -69,7 +72,7 @@ class MapServices:
         loaded = node.attempt(self._read, empty)
         self._unread = node.faults[before:]
         self._keeper.take()
-        may_recover = node.live and config.mode == 'mapping'
+        may_recover = node.live and (config.mode == 'mapping' or self._memory.asked is not None)
         recovered, note = self._keeper.recover(config.autosave_period if may_recover else 0.0)
         if note:
             node.get_logger().warning(note)
@@ -89,6 +92,16 @@ class MapServices:
     def doubts(self) -> str:
         """Warnings: the map's dictionary differs from the detector's, autosaves fail; empty without any."""
         return '; '.join(filter(None, (self._other_dictionary, self._keeper.fault)))
+
+    def remember(self) -> None:
+        """Save what a mapper that starts again in flight begins with: whether the map is frozen.
+
+        Raises
+        ------
+        InputError
+            It could not be saved; raised once.
+        """
+        self._memory.save()
 
     def _autosave(self) -> None:
         self._node.guard(self._keeper.autosave, self.mapper.map)
@@ -174,7 +187,7 @@ class MapServices:
             raise InputError('the map is frozen')
 
     def _on_freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self.mapper.frozen = bool(request.data)
+        self.mapper.frozen = self._memory.asked = bool(request.data)
         self.refinement.prepare()
         response.success, response.message = True, 'map frozen' if request.data else 'map free'
         return response
