@@ -38,6 +38,9 @@ _REFUSED = (
     *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR),
 )
 
+#: Of pathlib's error for a symbolic link that leads to itself.
+_LOOP = 'Symlink loop from '
+
 #: Exit status of an interrupted command, as a shell has it for SIGINT.
 INTERRUPTED = 130
 
@@ -114,6 +117,8 @@ def _reported(error: BaseException) -> tuple[int, str] | None:
         return 2, f'needs the Python package {error.name}: {INSTALL_HINT}'
     if type(error).__name__ == 'RCLError' and os.environ.get('ROS_SECURITY_ENABLE') == 'true':
         return 2, f'ROS_SECURITY_ENABLE is true: {str(error).splitlines()[0]}'
+    if isinstance(error, RuntimeError) and str(error).startswith(_LOOP):
+        return 2, f'{str(error).removeprefix(_LOOP)}: {os.strerror(errno.ELOOP)}'
     if isinstance(error, OSError) and error.errno in _REFUSED:
         _discard_output()
         return 2, f'{shown(error.filename or "output")}: {error.strerror}'

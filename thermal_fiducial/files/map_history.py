@@ -62,7 +62,15 @@ def autosave_file(path: Path) -> Path:
 
 
 def _beside(path: Path, ending: str) -> Path:
-    """A path beside the file itself, as a symbolic link may lead to the map of another place tomorrow."""
+    """A path beside the file itself, as a symbolic link may lead to the map of another place tomorrow.
+
+    Raises
+    ------
+    InputError
+        The path has no name, as ``.`` and ``/``.
+    """
+    if not path.name:
+        raise InputError(f'{path}: is a folder, not a file')
     file = path
     # Links that lead round are reported by whoever reads or writes the map.
     with suppress(OSError):
@@ -199,8 +207,8 @@ def undo(path: Path) -> MapVersion:
 
 def autosaved(path: Path) -> MapVersion | None:
     """The autosave of a mapper that ended without saving, if it is newer than the map."""
-    file = autosave_file(path)
     try:
+        file = autosave_file(path)
         if path.exists() and file.stat().st_mtime_ns < path.stat().st_mtime_ns:
             return None
         document = parse_document(str(file), read_text(file))

@@ -8,6 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 import numpy as np
 import pytest
 from support import small_bag
+from support.commands import status
 from support.walls import CAMERA, flight, see, SIZE, stamp, wall
 
 from thermal_fiducial.cli import map_sources
@@ -715,3 +716,22 @@ def test_ellipses_of_a_drawing_leave_its_markers_to_be_seen(poses, sigma, scale)
         for k, place in enumerate(places)
     }
     assert draw_map(MarkerMap(markers)).legends[0].get_title().get_text().endswith(f'three sigma{scale}')
+
+
+@pytest.mark.parametrize('action', ['history', 'undo'])
+def test_a_folder_has_no_earlier_versions(action, tmp_path, monkeypatch, capsys):
+    """A path without a name ended in a traceback."""
+    monkeypatch.chdir(tmp_path)
+    for folder in ('.', '/'):
+        assert status(['map', action, folder]) == 2
+        assert f'map: {folder}: is a folder, not a file' in capsys.readouterr().err
+
+
+def test_a_link_to_itself_is_reported(path, tmp_path, capsys):
+    """It ended in a traceback where the path of the link is looked for."""
+    loop = tmp_path / 'loop'
+    loop.symlink_to(loop)
+    assert status(['map', 'align', loop, '--cloud', path, '--out', tmp_path / 'aligned.yaml']) == 2
+    error = capsys.readouterr().err
+    assert str(loop) in error
+    assert 'Too many levels of symbolic links' in error

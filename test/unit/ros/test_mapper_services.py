@@ -185,9 +185,12 @@ def test_a_free_mapper_refines_in_a_process_of_its_own_in_either_mode(graph, map
     assert set(multiprocessing.active_children()) == before
 
 
-def test_a_map_file_with_a_name_that_no_file_can_have_is_a_fault_and_the_node_ends_in_order(graph):
-    node = graph.add(MarkerMapperNode, map_file='a' * 300 + '.yaml')
-    assert 'File name too long' in graph.diagnose(node)[1]
+@pytest.mark.parametrize(
+    ('name', 'words'), [('a' * 300 + '.yaml', 'File name too long'), ('/', '/: is a folder, not a file')]
+)
+def test_a_map_file_with_a_name_that_no_file_can_have_is_a_fault_and_the_node_ends_in_order(graph, name, words):
+    node = graph.add(MarkerMapperNode, map_file=name)
+    assert words in graph.diagnose(node)[1]
     node.close()
 
 
