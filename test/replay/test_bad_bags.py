@@ -1,6 +1,7 @@
 """What a replay makes of bags, parameters and maps that are broken: one line and exit status 2, never a traceback."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -43,6 +44,25 @@ def fails(outcome, *words):
 
 def test_no_bag(replay, tmp_path):
     fails(replay(tmp_path / 'nothing'), 'nothing')
+
+
+@pytest.mark.parametrize('which', ['bag', 'run', 'map'])
+def test_names_that_are_not_utf_8(replay, recording, tmp_path, which):
+    """ROS ended in a traceback, or could not read its parameters, or the run was there and could not be evaluated."""
+    folder = tmp_path / 'l\udcfc'
+    folder.mkdir()
+    bag = recording.write((folder if which == 'bag' else tmp_path) / 'bag')
+    map_file = shutil.copy(tmp_path / 'map.yaml', (folder if which == 'map' else tmp_path) / 'start.yaml')
+    extra = ['--out', folder / 'run'] if which == 'run' else []
+    fails(replay(bag, *extra, map_file=map_file), 'l\\udcfc', 'the name is not UTF-8, as all is that ROS reads')
+
+
+def test_names_with_blanks_and_letters_that_are_not_printable(replay, recording, tmp_path):
+    """A bag behind a no-break space was replayed, and its run could not be evaluated."""
+    folder = tmp_path / 'Prüf\u00a0stand \u200b'
+    folder.mkdir()
+    assert replay(recording.write(folder / 'bag'), '--out', folder / 'run')[0] == 0
+    assert main(['evaluate', str(folder / 'run'), '--no-report', '--json']) == 0
 
 
 @pytest.mark.parametrize('damage', ['cut', 'noise', 'empty'])

@@ -39,6 +39,11 @@ def is_there(path: str | Path) -> bool:
         return False
 
 
+def is_text(name: str) -> bool:
+    """Whether a name can be written to a file: Python has names of files that are not UTF-8 with surrogates."""
+    return not any('\ud800' <= letter <= '\udfff' for letter in name)
+
+
 def shown(name: str | Path) -> str:
     """A path or another name of any length and letters as a message has it."""
     name = str(name) if str(name).isprintable() else repr(str(name))

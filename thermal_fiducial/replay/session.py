@@ -17,6 +17,7 @@ from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.dictionary import copied_beside
 from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.files.reading import is_text, shown
 from thermal_fiducial.files.writing import into, write_text
 from thermal_fiducial.replay.job import ReplayJob
 from thermal_fiducial.replay.last_stamps import LastStamps
@@ -193,6 +194,9 @@ def _with_transport(settings: Settings, entry: Entry) -> Settings:
 
 def _settings(options: Options, warn: Callable[[str], None]) -> Settings:
     """The parameters of the nodes; doubts about them are passed to ``warn``."""
+    for path in filter(None, (options.bag.resolve(), options.run, options.map_file)):
+        if not is_text(str(path)):
+            raise InputError(f'{shown(path)}: the name is not UTF-8, as all is that ROS reads')
     overrides: dict[str, Any] = {}
     if options.map_file is not None:
         overrides['map_file'] = str(options.map_file)

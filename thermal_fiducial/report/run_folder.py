@@ -16,7 +16,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.plain_yaml import load_plain
-from thermal_fiducial.files.reading import is_there, naming, one_line, read_text, require_folder
+from thermal_fiducial.files.reading import is_text, is_there, naming, one_line, read_text, require_folder
 from thermal_fiducial.files.writing import unfinished
 from thermal_fiducial.report.output_bag import read_output, RecordedOutput
 from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
@@ -194,6 +194,11 @@ def _is_stamp(value: Any) -> bool:
     return isinstance(value, int) and abs(value) < _LARGEST_STAMP
 
 
+def _is_name(value: Any) -> bool:
+    """A path, or the name of a bag, which may have any letters: a no-break space is not printable."""
+    return isinstance(value, str) and is_text(value) and '\0' not in value
+
+
 def _is_text(value: Any) -> bool:
     return isinstance(value, str) and value.isprintable()
 
@@ -204,7 +209,8 @@ def _is_table_of(is_kind: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 #: Keys of a summary that the report reads, and their validation; others are ignored.
 _SUMMARY_KINDS: dict[str, Callable[[Any], bool]] = {
-    **dict.fromkeys(('bag', 'bag_path', 'mode', 'transport', 'second_camera'), _is_text),
+    **dict.fromkeys(('bag', 'bag_path'), _is_name),
+    **dict.fromkeys(('mode', 'transport', 'second_camera'), _is_text),
     'start_ns': _is_stamp,
     'duration_s': _is_duration,
     'last_ns': _is_table_of(_is_stamp),
