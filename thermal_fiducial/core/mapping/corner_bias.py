@@ -1,7 +1,6 @@
 """Systematic errors of the corners (lens, detector), learned from residuals that last."""
 
 from dataclasses import dataclass
-from functools import cached_property
 import math
 from statistics import median
 from typing import NamedTuple
@@ -10,7 +9,7 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import CHI2_OF_VIEW, INCONSISTENT_PX, SystematicErrors
 from thermal_fiducial.core.mapping.located import Location
-from thermal_fiducial.core.types import FloatArray, TINY
+from thermal_fiducial.core.types import FloatArray, Stacked, TINY
 
 #: What is known of the variance of the corners' bias at first, an inverse gamma distribution: a sum of squares [px^2]
 #: and its degrees of freedom. Its mode is 0.1 px, which good calibrations leave, its mean 0.3 px: published lenses of
@@ -59,12 +58,17 @@ class CornerBias:
 
     def _weight(self, fitted: '_FittedCorners', shown: 'ShownErrors') -> float:
         """What a frame counts beside one of an exact map: the variance of a product is the square of the residuals'."""
-        expected = shown.own * fitted.noise_variance + shown.smooth * self.likely_px**2
-        return (expected / (expected + fitted.map_variance)) ** 2
+        corners, taken_up = fitted.corners, fitted.taken_up
+        noise_variance = float(corners.shares**2 @ corners.noise_px**2) / len(corners.shares)
+        draws = corners.map_draws.reshape(len(taken_up), -1)
+        map_variance = float(np.mean(np.square(draws - taken_up @ (taken_up.T @ draws))))
+        expected = shown.own * noise_variance + shown.smooth * self.likely_px**2
+        return (expected / (expected + map_variance)) ** 2
 
     def add(self, location: Location) -> None:
         """Update with the residuals of a located frame."""
-        before, self._last = self._last, (location, _FittedCorners.of(location, self.likely_px))
+        corners = _WeightedCorners.of(location, self.likely_px)
+        before, self._last = self._last, (location, _FittedCorners.of(corners))
         if before is None or location.pose.stamp_ns <= before[0].pose.stamp_ns:
             return
         last = before[0]
@@ -77,8 +81,9 @@ class CornerBias:
         residuals, former = fitted.residuals, former_fitted.residuals
         products = _mean_products(residuals, former)
         of_shape = products - (residuals.mean(axis=1) * former.mean(axis=1)).sum(axis=1) / 2.0
-        of_shape = np.clip(of_shape / (fitted.noise_px * former_fitted.noise_px), -LARGEST_SHAPE, LARGEST_SHAPE)
-        shares = fitted.shares * former_fitted.shares
+        corners, former_corners = fitted.corners, former_fitted.corners
+        of_shape = np.clip(of_shape / (corners.noise_px * former_corners.noise_px), -LARGEST_SHAPE, LARGEST_SHAPE)
+        shares = corners.shares * former_corners.shares
         # Residuals of moved or mistaken markers are correlated too.
         bounds = _bounds(products, min(INCONSISTENT_PX, BIAS_OUTLIER * self.likely_px))
         shown, common = shown_errors(fitted, former_fitted, bounds)
@@ -148,23 +153,23 @@ class ShownErrors(NamedTuple):
         return (self.product - min(max(own, 0.0) * self.own, known)) / self.smooth
 
 
-@dataclass(frozen=True)
-class _FittedCorners:
-    """Weighted corners of the markers of a frame: what the smooth error is at them, and what the pose takes up."""
+@dataclass(frozen=True, slots=True)
+class _WeightedCorners(Stacked):
+    """Corners of the N markers of a frame, with weights of the markers."""
 
-    #: (N,) weights of the markers: those with more noise than the frame's median have less, and mistaken ones
+    #: (N,) weights: markers with more noise than the frame's median have less, and mistaken ones
     shares: FloatArray
     #: (N,) standard deviation of a coordinate of their corners [px]
     noise_px: FloatArray
-    #: (N, 4, 2) [px] as located, and their derivatives (N, 8, 6) by the pose
+    #: (N, 4, 2) residuals [px] as located, and derivatives of the corners (N, 8, 6) by the pose
     located: FloatArray
     J: FloatArray
     #: with those weights: (N, 4, I) factors of the smooth error, and (N, 8, K) joint draws of the map's errors in them
-    modes_of_markers: FloatArray
+    modes: FloatArray
     map_draws: FloatArray
 
-    @classmethod
-    def of(cls, location: Location, bias_px: float) -> '_FittedCorners':
+    @staticmethod
+    def of(location: Location, bias_px: float) -> '_WeightedCorners':
         """All markers of a frame; ``bias_px`` is the standard deviation of the bias, as known by then."""
         noise, fit = location.sight.noise_px, location.reprojection
         by_noise, residuals = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2), fit.residuals
@@ -176,57 +181,42 @@ class _FittedCorners:
                 break
         weights = shares[:, None, None]
         map_draws = weights * (fit.J_marker @ location.sight.draws)
-        return cls(shares, noise, fit.residuals, fit.J_camera, weights * location.lens.modes, map_draws)
+        return _WeightedCorners(shares, noise, fit.residuals, fit.J_camera, weights * location.lens.modes, map_draws)
+
+
+class _FittedCorners(NamedTuple):
+    """What the smooth error is at n weighted corners of a frame, and what the pose takes up of it."""
+
+    corners: _WeightedCorners
+    #: (N, 4, 2) [px] at the pose that these corners alone fit best: the located pose has odometry in it, and weights by
+    #: the map, and what that displaces it is no error of the lens
+    residuals: FloatArray
+    #: (n, I) of either coordinate of all corners, and (I, I) products of these
+    modes: FloatArray
+    gram: FloatArray
+    #: (2 n, 6) orthonormal directions, along which the pose takes up weighted errors; (2 I, 6) by the smooth error's
+    #: factors
+    taken_up: FloatArray
+    smooth_taken_up: FloatArray
+
+    @staticmethod
+    def of(corners: _WeightedCorners) -> '_FittedCorners':
+        """The fit of the pose to all ``corners``."""
+        modes = corners.modes.reshape(-1, corners.modes.shape[-1])
+        taken_up = np.linalg.qr((corners.shares[:, None, None] * corners.J).reshape(-1, 6))[0]
+        residuals = _refitted(corners.located, corners.J, corners.shares)
+        return _FittedCorners(corners, residuals, modes, modes.T @ modes, taken_up, _by_factors(modes, taken_up))
 
     def only(self, chosen: list[int]) -> '_FittedCorners':
-        """The markers at the places ``chosen``."""
-        if chosen == list(range(len(self.shares))):
+        """The fit to the markers at the places ``chosen``."""
+        if chosen == list(range(len(self.residuals))):
             return self
-        fields = self.shares, self.noise_px, self.located, self.J, self.modes_of_markers, self.map_draws
-        return _FittedCorners(*(field[chosen] for field in fields))
+        return _FittedCorners.of(self.corners.only(np.array(chosen)))
 
-    @cached_property
-    def residuals(self) -> FloatArray:
-        """(N, 4, 2) [px] at the pose that these corners alone fit best.
 
-        The located pose has odometry in it, and weights by the map: what that displaces it is no error of the lens.
-        """
-        return _refitted(self.located, self.J, self.shares)
-
-    @property
-    def noise_variance(self) -> float:
-        """Variance of a weighted corner by its noise [px^2]."""
-        return float(self.shares**2 @ self.noise_px**2) / len(self.shares)
-
-    @property
-    def map_variance(self) -> float:
-        """Variance that the map's errors add to a weighted residual [px^2]."""
-        draws = self.map_draws.reshape(len(self.taken_up), -1)
-        return float(np.mean(np.square(draws - self.taken_up @ (self.taken_up.T @ draws))))
-
-    @cached_property
-    def modes(self) -> FloatArray:
-        """(n, I) of either coordinate of all corners."""
-        return self.modes_of_markers.reshape(-1, self.modes_of_markers.shape[-1])
-
-    @cached_property
-    def taken_up(self) -> FloatArray:
-        """(2 n, 6) orthonormal directions, along which the pose takes up weighted errors."""
-        return np.linalg.qr((self.shares[:, None, None] * self.J).reshape(-1, 6))[0]
-
-    @cached_property
-    def smooth_taken_up(self) -> FloatArray:
-        """(2 I, 6) of the smooth error, by its factors."""
-        return self.by_factors(self.taken_up)
-
-    @cached_property
-    def gram(self) -> FloatArray:
-        """(I, I) of ``modes``."""
-        return np.asarray(self.modes.T @ self.modes)
-
-    def by_factors(self, corners: FloatArray) -> FloatArray:
-        """(2 I, k) sums of (2 n, k) over the corners, by the factors of the smooth error."""
-        return np.asarray((self.modes.T @ corners.reshape(len(self.modes), -1)).reshape(-1, corners.shape[-1]))
+def _by_factors(modes: FloatArray, corners: FloatArray) -> FloatArray:
+    """(2 I, k) sums of (2 n, k) over the corners, by the factors of the smooth error: ``modes`` (n, I)."""
+    return np.asarray((modes.T @ corners.reshape(len(modes), -1)).reshape(-1, corners.shape[-1]))
 
 
 def shown_errors(now: _FittedCorners, former: _FittedCorners, bound: FloatArray) -> tuple[ShownErrors, float]:
@@ -241,19 +231,20 @@ def shown_errors(now: _FittedCorners, former: _FittedCorners, bound: FloatArray)
     that, and the share, 0 to 1, of the smooth error in the present residuals that was in the former ones
     """
     n = len(now.modes)
-    r_now, r_former = ((bound * of.shares * of.residuals.T).T.reshape(-1, 1) for of in (now, former))
+    r_now, r_former = ((bound * of.corners.shares * of.residuals.T).T.reshape(-1, 1) for of in (now, former))
     common = now.taken_up.T @ former.taken_up
     up_now, up_former = now.smooth_taken_up, former.smooth_taken_up
     both_up = up_now.T @ up_former
     smooth = 2.0 * np.vdot(now.modes, former.modes) + np.vdot(common, both_up)
-    smooth -= np.vdot(up_now, former.by_factors(now.taken_up)) + np.vdot(up_former, now.by_factors(former.taken_up))
+    crossed = _by_factors(former.modes, now.taken_up), _by_factors(now.modes, former.taken_up)
+    smooth -= np.vdot(up_now, crossed[0]) + np.vdot(up_former, crossed[1])
     both = 2.0 * np.vdot(now.gram, former.gram) + np.vdot(both_up, both_up)
     for gram, up in ((now.gram, up_former), (former.gram, up_now)):
         of_coordinates = up.reshape(len(gram), -1)
         both -= np.vdot(of_coordinates, gram @ of_coordinates)
     sums = (
         np.vdot(r_now, r_former),
-        np.vdot(now.by_factors(r_now), former.by_factors(r_former)),
+        np.vdot(_by_factors(now.modes, r_now), _by_factors(former.modes, r_former)),
         2.0 * n - 12.0 + np.vdot(common, common),
         smooth,
         both,
