@@ -22,12 +22,13 @@ from thermal_fiducial.core.detection.corners.sides import (
     Blur,
     blur_of,
     EdgeModel,
+    free_distance,
     model,
     Sides,
     sides_of,
 )
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
-from thermal_fiducial.core.detection.corners.warm_surface import ending_sides, freed_of_unevenness, Reach
+from thermal_fiducial.core.detection.corners.warm_surface import ending_sides, freed_of_unevenness, nearer
 from thermal_fiducial.core.detection.prediction.frame import counts_of, MotionBlur
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import widths
@@ -74,7 +75,7 @@ def refine_corners(
     columns: int = OF_CLEAR,
     motion: MotionBlur | None = None,
     passes: int = PASSES,
-    reach: Reach | None = None,
+    reach: FloatArray | None = None,
 ) -> RefinedCorners:
     """Corners of N markers; those that have not converged are refined again, in so many passes at most.
 
@@ -86,7 +87,8 @@ def refine_corners(
     blur_px : standard deviation of optics and pixel
     columns : of pixels, in a segment
     motion : blur by motion; none when left out
-    reach : which pixels count; all that the cells allow when left out
+    reach : (N, 2, 4) distances inside and outside the sides up to which pixels count [px]; when left out, as far as
+        the cells allow
     """
     motion = motion or MotionBlur.none(len(corners.px))
     motion_px = np.hypot(motion.spread[:, 0], motion.spread[:, 1])
@@ -94,8 +96,9 @@ def refine_corners(
     sides = sides_of(corners.x, camera, image.shape, cells, columns, widest)
     blur = blur_of(sides, blur_px, motion.spread)
     counts = counts_of(sides.pixel, image, motion.to_tails)
-    reach = reach or Reach.everywhere(len(corners.px))
-    inside, outside = reach.limits(sides, blur.across)
+    reach = np.full((len(corners.px), 2, 4), np.inf) if reach is None else reach
+    free = free_distance(sides, blur.across)
+    inside, outside = (np.minimum(free, reach[:, part].reshape(-1, 1)) for part in (0, 1))
     modelled, outward = model(sides, blur, inside, outside), sides.within_columns(outside)
     measured, displaced_px = _measured(counts, modelled, sides, blur, outward, motion_px)
     segments, shows = with_gradients(measured, sides, widest)
@@ -108,9 +111,7 @@ def refine_corners(
     if len(which) == 0:
         return refined
     start = corners.only(which).at_pixels(refined.corners_px[which])
-    again = refine_corners(
-        image, start, camera, cells, blur_px, columns, motion.only(which), passes - 1, reach.only(which)
-    )
+    again = refine_corners(image, start, camera, cells, blur_px, columns, motion.only(which), passes - 1, reach[which])
     refined.put(which, again)
     return refined
 
@@ -120,10 +121,10 @@ def _again(
     shows: BoolArray,
     ending: BoolArray,
     shifts: FloatArray,
-    reach: Reach,
+    reach: FloatArray,
     outward: FloatArray,
     width: FloatArray,
-) -> tuple[IntArray, Reach]:
+) -> tuple[IntArray, FloatArray]:
     """Places (M,) of those of N markers that are to be refined again, and the reach of all.
 
     From farther off near pixels pull towards another edge, and another edge ends the surface.
@@ -138,8 +139,9 @@ def _again(
     if ending.any():
         ending = ending & (np.abs(shifts).max(axis=(1, 2)) < _SETTLED_PX[1])[:, None]
     if shows.any() or ending.any():
-        moving = moving | (shows & ~reach.near) | ending.any(axis=1)
-        reach = reach.nearer(shows, ending, outward, width)
+        is_near = np.isfinite(reach[:, 0]).any(axis=1)
+        moving = moving | (shows & ~is_near) | ending.any(axis=1)
+        reach = nearer(reach, shows, ending, outward, width)
     return moving.nonzero()[0], reach
 
 

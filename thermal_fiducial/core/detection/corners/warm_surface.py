@@ -10,7 +10,6 @@ pixels alone count. And where the warm surface ends within the columns, only tho
 is darker outward the end shows.
 """
 
-from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -18,8 +17,8 @@ import numpy as np
 
 from thermal_fiducial.core.detection.corners.corner_errors import SURFACE_FALLS
 from thermal_fiducial.core.detection.corners.segments import Segments
-from thermal_fiducial.core.detection.corners.sides import EdgeModel, free_distance, Sides
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Stacked
+from thermal_fiducial.core.detection.corners.sides import EdgeModel, Sides
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
 # Displacement of a blurred step with a slope on one side of it, fitted as a step, over the product of its blur, the
 # distance up to which pixels count, and the slope over the contrast: 0.80 to 0.87 for a blur of 0.5 to 0.9 px and
@@ -133,44 +132,20 @@ def _quadratic(contrast: FloatArray, used: BoolArray, cells: int) -> FloatArray:
     return np.asarray(amounts @ around.drawn)
 
 
-@dataclass(frozen=True, slots=True)
-class Reach(Stacked):
-    """Distances from the sides of N markers up to which pixels count [px]; infinite where cells alone limit them."""
+def nearer(
+    reach: FloatArray, uneven: BoolArray, ending: BoolArray, outward: FloatArray, width: FloatArray
+) -> FloatArray:
+    """A ``reach`` with near pixels alone for ``uneven`` markers (N,), and less at ``ending`` sides (N, 4).
 
-    #: (N, 4) each
-    inside: FloatArray
-    outside: FloatArray
-
-    @staticmethod
-    def everywhere(count: int) -> 'Reach':
-        """As far as the cells of ``count`` markers allow."""
-        return Reach(np.full((count, 4), np.inf), np.full((count, 4), np.inf))
-
-    @property
-    def near(self) -> BoolArray:
-        """Which markers (N,) are measured by pixels near their sides alone."""
-        return np.asarray(np.isfinite(self.inside).any(axis=1))
-
-    def limits(self, sides: Sides, width: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Distances (E, m) inside and outside the sides up to which pixels count, for blur of ``width`` (E, m) [px]."""
-        free = free_distance(sides, width)
-        return np.minimum(free, self.inside.reshape(-1, 1)), np.minimum(free, self.outside.reshape(-1, 1))
-
-    def nearer(self, uneven: BoolArray, ending: BoolArray, outward: FloatArray, width: FloatArray) -> 'Reach':
-        """The same with near pixels alone for ``uneven`` markers (N,), and less at ``ending`` sides (N, 4).
-
-        Parameters
-        ----------
-        outward, width : (E, m) distance outside the sides up to which pixels count, and the blur [px]
-        """
-        outward, width = (part.mean(axis=1).reshape(-1, 4) for part in (outward, width))
-        near = np.where(uneven[:, None], _WITH_GRADIENT * width, np.inf)
-        before = np.where(ending, np.maximum(outward - _END_REACHES * width, _LEAST_WHITE * width), np.inf)
-        return replace(
-            self,
-            inside=np.minimum(self.inside, near),
-            outside=np.minimum(self.outside, np.minimum(near, before)),
-        )
+    Parameters
+    ----------
+    reach : (N, 2, 4) distances inside and outside the sides of N markers up to which pixels count [px]
+    outward, width : (E, m) distance outside the sides up to which pixels count, and the blur [px]
+    """
+    outward, width = (part.mean(axis=1).reshape(-1, 4) for part in (outward, width))
+    near = np.where(uneven[:, None], _WITH_GRADIENT * width, np.inf)
+    before = np.where(ending, np.maximum(outward - _END_REACHES * width, _LEAST_WHITE * width), np.inf)
+    return np.asarray(np.minimum(reach, np.stack([near, np.minimum(near, before)], axis=1)))
 
 
 def ending_sides(
