@@ -92,7 +92,7 @@ class MarkerDetector:
         keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
         frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)
         found, history = self._finder.find(frame, history, known, guide, config)
-        refined, scale = refine(frame, found, history.track, history.gray_scale, self._decoder, config)
+        refined, scale = refine(frame, found, history.track, history.gray_scale, self._decoder)
         refined = confirmed(frame, found, refined, self._decoder, config)
         ids, corners = refined.ids, refined.corners
         at = refined.places.at.at_pixels(corners.corners_px)

@@ -18,7 +18,7 @@ from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 
 CAMERA = Camera(640, 512, [[440.0, 0, 319.5], [0, 440.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
 TWIST = Twist(np.array([0.8, -1.5, 0.6, -1.8, 1.5, 0.8]), np.eye(6), np.array([3.0, 0.0, 2.0, 6.0, -4.0, 5.0]))
-FRAME = Frame(0, np.zeros((512, 640), dtype=np.float32), 1.0, CAMERA, TWIST, 0.0, 0.025)
+FRAME = Frame(0, np.zeros((512, 640), dtype=np.float32), 1.0, CAMERA, TWIST, 0.0, 0.025, 0.66)
 
 
 def points():

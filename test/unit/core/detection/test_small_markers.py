@@ -325,7 +325,7 @@ def test_markers_that_smoke_makes_unlike_their_patterns_show_the_motion():
     last = ExpectedMarkers(ids, ImagePoints.at(px - [3.0, 0.0], CAMERA).x, depth, np.full(len(ids), 20.0))
     track = MotionTrack(np.eye(4), config.bolometer_lag).after(0, predicted, last)
     decoder = Decoder(dictionary.bits, dictionary.correctable)
-    refined, _ = refine(frame, found, track, UNKNOWN_SCALE, decoder, config)
+    refined, _ = refine(frame, found, track, UNKNOWN_SCALE, decoder)
     assert not refined.observed.evident.any()
     moved = (refined.places.flow @ refined.twist.value)[..., 0].mean() * dt
     np.testing.assert_allclose(moved, 3.0, atol=0.3)

@@ -146,13 +146,7 @@ def nearness(corners_px: FloatArray, cells: int, blurs_px: FloatArray) -> IntArr
 
 
 def fitted_patterns(
-    frame: Frame,
-    found: FoundMarkers,
-    start: ImagePoints,
-    view: PatternView,
-    nearer: int,
-    decoder: Decoder,
-    blur_px: float,
+    frame: Frame, found: FoundMarkers, start: ImagePoints, view: PatternView, nearer: int, decoder: Decoder
 ) -> RefinedCorners:
     """Corners of N markers by their patterns, and of small ones what evidence of the markers these are.
 
@@ -162,9 +156,8 @@ def fitted_patterns(
     start : (N, 4) corners in the image, accurate to half a cell
     view : the image; of raw counts, without lag tails
     nearer : of :func:`nearness`, the same for all
-    blur_px : standard deviation of the blur of optics and pixels
     """
-    fit = fit_patterns(view, start.px, found.ids, decoder, blur_px, nearer)
+    fit = fit_patterns(view, start.px, found.ids, decoder, frame.blur_px, nearer)
     # The two constraints of a square in space hold for them, too.
     square = as_squares(start.at_pixels(fit.corners_px), np.zeros((len(found.ids), 8, 1)), fit.covariance)
     floor = OF_DISPLAYED_PATTERN_PX if frame.displayed else OF_PATTERN_PX
@@ -173,11 +166,11 @@ def fitted_patterns(
     doubt = np.where(fit.step_px > _CONVERGED_PX, np.maximum(doubt, fit.step_px**2), doubt)
     off = np.abs(corners - start.px).max(axis=(1, 2)) * decoder.cells / sides_px(start.px)
     covariances = square.corner_covariances + floor**2 * _EYE
-    small = too_small_for_sides(start.px, decoder.cells, blur_px)
+    small = too_small_for_sides(start.px, decoder.cells, frame.blur_px)
     evident, refuted = small & found.certain & (off < _NEAR), np.zeros(len(small), dtype=bool)
     others = np.flatnonzero(small & ~evident)
     if len(others):
-        evident[others], refuted[others] = _verdicts(fit, found, others, frame, decoder, blur_px)
+        evident[others], refuted[others] = _verdicts(fit, found, others, frame, decoder)
     return RefinedCorners(corners, covariances, fit.contrast, fit.noise, doubt, small, evident, refuted)
 
 
@@ -313,14 +306,14 @@ def _moved(at: PatternResiduals, step: FloatArray, blur_px: float | FloatArray) 
 
 
 def _verdicts(
-    fit: PatternFit, found: FoundMarkers, which: IntArray, frame: Frame, decoder: Decoder, blur_px: float
+    fit: PatternFit, found: FoundMarkers, which: IntArray, frame: Frame, decoder: Decoder
 ) -> tuple[BoolArray, BoolArray]:
     """Which fits at places ``which`` are evidence enough, of all markers and places that might be one by chance.
 
     And which are none although the image is clear: more than noise is left, and something else may be there as well.
     """
     height, width = frame.image.shape
-    evidence, lead = evidence_of(fit.residuals, which, found.ids, decoder, blur_px)
+    evidence, lead = evidence_of(fit.residuals, which, found.ids, decoder, frame.blur_px)
     places = height * width / np.maximum(sides_px(fit.corners_px[which]) ** 2, 1.0)
     tried = 4.0 * decoder.count * np.where(found.expected[which], 1.0, places)
     evident = (evidence > np.log(tried / _FALSE_MARKERS)) & (lead > -math.log(_FALSE_MARKERS))

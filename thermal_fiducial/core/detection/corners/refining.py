@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.blurred_patterns import lens_bends, PatternView
 from thermal_fiducial.core.detection.corners.corner_errors import of_motion_blur, RefinedCorners, unknown_motion
 from thermal_fiducial.core.detection.corners.gray_scale import GrayScale
@@ -79,12 +78,7 @@ class RefinedMarkers(Stacked):
 
 
 def refine(
-    frame: Frame,
-    found: FoundMarkers,
-    track: MotionTrack,
-    scale: GrayScale,
-    decoder: Decoder,
-    config: ArucoDetectorConfig,
+    frame: Frame, found: FoundMarkers, track: MotionTrack, scale: GrayScale, decoder: Decoder
 ) -> tuple[RefinedMarkers, GrayScale]:
     """Corners of N markers, and the gray scale of the display as it is known then.
 
@@ -104,10 +98,10 @@ def refine(
         start = places.at.at_pixels(places.at.px + blur.shift)
         bent = frame.displayed and blur.to_tails is not None
         shown = frame.in_counts(scale.counts) if bent else frame
-        refined = _measured(shown, found, start, blur, columns, decoder, config)
+        refined = _measured(shown, found, start, blur, columns, decoder)
         markers = _at_stamp(frame, found.ids, places, blur, refined, twist, track, decoder.cells)
         if bent:
-            scale = _shown_scale(frame, scale, markers, start, decoder, config)
+            scale = _shown_scale(frame, scale, markers, start, decoder)
         change = np.abs(markers.corners.corners_px - refined.corners_px + blur.shift)
         settled = change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX and not (bent and scale.differs(before))
         if markers.twist is None or settled:
@@ -117,60 +111,44 @@ def refine(
 
 
 def _shown_scale(
-    frame: Frame,
-    before: GrayScale,
-    markers: RefinedMarkers,
-    start: ImagePoints,
-    decoder: Decoder,
-    config: ArucoDetectorConfig,
+    frame: Frame, before: GrayScale, markers: RefinedMarkers, start: ImagePoints, decoder: Decoder
 ) -> GrayScale:
     """The gray scale of the display that markers show, which were looked for at ``start`` (N, 4)."""
     bends = lens_bends(start, frame.camera)
     view = PatternView(frame.image, lag=markers.blur.lag, bends=bends, saturation=frame.saturation)
     corners = markers.observed.corners_px + markers.blur.removed
-    return before.shown_by(view, corners, markers.ids, decoder, config.blur_px)
+    return before.shown_by(view, corners, markers.ids, decoder, frame.blur_px)
 
 
 def _measured(
-    frame: Frame,
-    found: FoundMarkers,
-    start: ImagePoints,
-    blur: MotionBlur,
-    columns: int,
-    decoder: Decoder,
-    config: ArucoDetectorConfig,
+    frame: Frame, found: FoundMarkers, start: ImagePoints, blur: MotionBlur, columns: int, decoder: Decoder
 ) -> RefinedCorners:
     """Corners of N markers in the image: by their sides, or by their whole patterns."""
-    whole = too_blurred_for_sides(start.px, decoder.cells, config.blur_px, blur)
+    whole = too_blurred_for_sides(start.px, decoder.cells, frame.blur_px, blur)
     if whole.all():
-        return _by_patterns(frame, found, start, blur, decoder, config)
+        return _by_patterns(frame, found, start, blur, decoder)
     others, of_sides = (start.only(~whole), blur.only(~whole)) if whole.any() else (start, blur)
     # On displays sides are where fits of patterns begin.
     passes = 1 if frame.displayed else PASSES
     image = frame.pixels if blur.to_tails is None else frame.image
-    refined = refine_corners(image, others, frame.camera, decoder.cells, config.blur_px, columns, of_sides, passes)
+    refined = refine_corners(image, others, frame.camera, decoder.cells, frame.blur_px, columns, of_sides, passes)
     if frame.displayed:
         # Fits of large patterns do not converge from corners that are off by half a cell.
         px = start.px.copy()
         px[~whole] = refined.corners_px
-        return _by_patterns(frame, found, start.at_pixels(px), blur, decoder, config)
+        return _by_patterns(frame, found, start.at_pixels(px), blur, decoder)
     if not whole.any():
         return refined
-    fitted = _by_patterns(frame, found.only(whole), start.only(whole), blur.only(whole), decoder, config)
+    fitted = _by_patterns(frame, found.only(whole), start.only(whole), blur.only(whole), decoder)
     return refined.joined(fitted).only(_places(whole))
 
 
 def _by_patterns(
-    frame: Frame,
-    found: FoundMarkers,
-    start: ImagePoints,
-    blur: MotionBlur,
-    decoder: Decoder,
-    config: ArucoDetectorConfig,
+    frame: Frame, found: FoundMarkers, start: ImagePoints, blur: MotionBlur, decoder: Decoder
 ) -> RefinedCorners:
     """Corners of N markers by their whole patterns."""
     # Each group is sampled alike.
-    near = nearness(start.px, decoder.cells, np.hypot(config.blur_px, np.hypot(*blur.spread.T)))
+    near = nearness(start.px, decoder.cells, np.hypot(frame.blur_px, np.hypot(*blur.spread.T)))
     refined = RefinedCorners.none()
     # At rest the model of a bent gray scale contains its ends.
     saturation = None if blur.to_tails is None else frame.saturation
@@ -178,15 +156,8 @@ def _by_patterns(
         which = near == nearer
         there, moving = start.only(which), blur.only(which)
         bends = lens_bends(there, frame.camera)
-        view = PatternView(
-            frame.image,
-            moving.to_tails,
-            moving.spread,
-            displayed=frame.displayed,
-            bends=bends,
-            saturation=saturation,
-        )
-        fitted = fitted_patterns(frame, found.only(which), there, view, nearer, decoder, config.blur_px)
+        view = PatternView(frame.image, moving.to_tails, moving.spread, None, frame.displayed, bends, saturation)
+        fitted = fitted_patterns(frame, found.only(which), there, view, nearer, decoder)
         refined = refined.joined(fitted)
     return refined.only(_places(near))
 

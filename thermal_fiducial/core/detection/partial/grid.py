@@ -217,7 +217,7 @@ def pose_jacobian(T: FloatArray, points: FloatArray, camera: Camera) -> FloatArr
     return np.concatenate([by_point, by_point @ by_turn], axis=-1)
 
 
-def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) -> Layer:
+def layer_of(frame: Frame, window: FloatArray, factor: int = 1) -> Layer:
     """The frame reduced by ``factor``, with the motion blur at a ``window`` (4, 3) in the camera frame.
 
     At full resolution large lag tails are removed, as around whole markers: an edge with a tail, fitted as if its blur
@@ -230,7 +230,7 @@ def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) 
         cropped = image[: camera.height * factor, : camera.width * factor]
         image = np.asarray(cv2.resize(cropped, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
         to_tails, lag_blur = None, motion.lag[0].mean(axis=0) / factor
-    blur = math.hypot(blur_px / factor, math.sqrt((1.0 - 1.0 / factor**2) / 12.0))
+    blur = math.hypot(frame.blur_px / factor, math.sqrt((1.0 - 1.0 / factor**2) / 12.0))
 
     def displacement(points: FloatArray) -> FloatArray:
         if frame.twist is None:

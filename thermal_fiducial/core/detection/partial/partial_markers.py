@@ -118,7 +118,7 @@ class PartialMarkerSearch:
         """Corners of a marker by a fit at low, then at full resolution; None if it does not show its pattern."""
         points = on_marker(self._visible.places, marker.size)
         factor = int(2 ** np.clip(np.floor(np.log2(marker.cell_px / _COARSE_PX)), 0, 3))
-        coarse = layer_of(frame, marker.window_in_camera(), config.blur_px, factor)
+        coarse = layer_of(frame, marker.window_in_camera(), factor)
         T = self._moved(marker, points, coarse, marker.cell_px / factor)
         if T is None:
             return None
@@ -127,7 +127,7 @@ class PartialMarkerSearch:
         least_counts = config.guided_min_contrast * frame.noise
         if rough is None or self._contrast(rough, marker, coarse) < least_counts:
             return None
-        fine, fit = layer_of(frame, marker.window_in_camera(), config.blur_px), rough
+        fine, fit = layer_of(frame, marker.window_in_camera()), rough
         for _ in range(_STEPS):
             step = adjusted(fit.T_camera_marker, marker.size, pattern, fine, config.plate_thickness)
             if step is None:

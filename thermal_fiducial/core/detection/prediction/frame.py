@@ -71,6 +71,8 @@ class Frame:
     #: time constant of the bolometers, and time from the first row's sampling to the last's [s]
     lag: float
     readout: float
+    #: standard deviation of the blur by optics and pixels [px]
+    blur_px: float
     #: whether it is a picture for a display, whose gain control is a nonlinear function of the counts
     displayed: bool = False
     #: (height, width) as received
@@ -91,8 +93,8 @@ class Frame:
         """A frame; the fixed pattern of its columns is removed unless ``keep_columns``."""
         noise, displayed = pixel_noise(counts), bool(counts[::_ROW_STEP].max() < _LEVELS)
         pixels = counts if keep_columns else with_columns_corrected(counts.astype(np.float32), noise)
-        lag, readout = config.bolometer_lag, config.readout_time
-        return Frame(stamp_ns, pixels, noise, camera, twist, lag, readout, displayed, counts)
+        lag, readout, blur_px = config.bolometer_lag, config.readout_time, config.blur_px
+        return Frame(stamp_ns, pixels, noise, camera, twist, lag, readout, blur_px, displayed, counts)
 
     @cached_property
     def image(self) -> Float32Array:
