@@ -9,7 +9,7 @@ import pytest
 from support.walls import CAMERA, hung, look, see, SIZE, stamp
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.error_model import SystematicErrors
+from thermal_fiducial.core.error_model import CORNER_LENGTH, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
@@ -22,7 +22,7 @@ GRID = np.stack(np.meshgrid(np.linspace(0, 640, 17), np.linspace(0, 512, 14)), a
 
 def lens(rng):
     """A smooth error of the lens (n, 2) [px] at the places of the grid, and by the focal length."""
-    squared = np.sum((GRID[:, None] - GRID) ** 2, axis=-1) / (ERRORS.corner_length * CAMERA.width) ** 2
+    squared = np.sum((GRID[:, None] - GRID) ** 2, axis=-1) / (CORNER_LENGTH * CAMERA.width) ** 2
     smooth = np.linalg.cholesky(np.exp(-0.5 * squared) + 1e-7 * np.eye(len(GRID))) @ rng.normal(size=GRID.shape)
     return ERRORS.corner_px * smooth + ERRORS.focal_length_std * rng.normal() * (GRID - CAMERA.principal_point)
 

@@ -8,7 +8,7 @@ from support.walls import CAMERA, hung, look, rows, see, SIZE
 from support.wrong_lenses import drawn_lens
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.error_model import SystematicErrors
+from thermal_fiducial.core.error_model import CORNER_LENGTH, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import corners_px
@@ -45,7 +45,7 @@ def cameras(sides, rng):
 
 def frames_of(sides, poses, rng):
     """What is detected, with a draw of all errors that the error model declares of corners, lens and sides."""
-    K, lens = CAMERA.K.copy(), drawn_lens(rng, ERRORS.corner_px, length=ERRORS.corner_length)
+    K, lens = CAMERA.K.copy(), drawn_lens(rng, ERRORS.corner_px, length=CORNER_LENGTH)
     K[:2, :2] *= 1.0 + ERRORS.focal_length_std * rng.normal()
     size = SIZE * (1.0 + ERRORS.marker_size_std * rng.normal())
     shapes = {key: ERRORS.marker_shape * SIGMA_PX * rng.normal(size=(4, 2)) for key in poses}

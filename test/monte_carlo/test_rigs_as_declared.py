@@ -10,7 +10,7 @@ from support.sim_flights import simulated
 
 from thermal_fiducial.config import MarkerMapperConfig, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import rows_from_corners
-from thermal_fiducial.core.error_model import SystematicErrors
+from thermal_fiducial.core.error_model import CORNER_LENGTH
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.corner_bias import BIAS_FREEDOM, BIAS_SQUARES
 from thermal_fiducial.core.mapping.map_data import MarkerMap
@@ -34,7 +34,7 @@ def as_calibrated(flight, rng, lens_px):
     turn = so3_exp(FILTER.extrinsics_orientation_std * rng.normal(size=3))
     shift = FILTER.extrinsics_position_std * rng.normal(size=3)
     camera, grown = replace(flight.camera, K=K), 1.0 + MAPPER.marker_size_std * rng.normal()
-    off = smooth_error(rng, SystematicErrors().corner_length * camera.width)
+    off = smooth_error(rng, CORNER_LENGTH * camera.width)
     frames = {}
     for stamp, rows in flight.frames.items():
         corners, sizes = corners_px(rows), np.full(len(rows), grown * flight.marker_size)

@@ -12,7 +12,7 @@ from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE
 SIZE = 0.3
 CAMERA = Camera(640, 512, np.array([[529.0, 0.0, 319.5], [0.0, 529.0, 255.5], [0.0, 0.0, 1.0]]))
 #: What corners of a detector with white noise have of them.
-NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 #: 30 frames a second, counted from 1 s.
 FRAME_NS = 33_333_333
 # A marker that hangs on the wall x = 0 and faces -x: its x to map -y, its y to map z.

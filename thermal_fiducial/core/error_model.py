@@ -27,12 +27,6 @@ class SystematicErrors:
     #: calibration leaves; flights begin with more, and learn it from residuals that last (``CornerBias``). Enters poses
     #: from markers, map and new markers (``LensErrors``).
     corner_px: float = 0.1
-    #: Distance over which that error stays the same [share of the image's width]: a lens model is wrong by a smooth
-    #: function. On the same board lengths of 0.1 to 0.25 fit, 0.5 leaves NEES 1.1, 1.0 leaves 1.25.
-    corner_length: float = 0.25
-    #: Corners [px] where one hypothesis is weighed against another. Enters the weights of views of new markers, the
-    #: choice between two poses, and weights by the map.
-    decision_px: float = 0.1
     #: Common relative error of the markers' sides: ways of measuring tags on one carpet differ by 1.2 %, a laser
     #: cutter's kerf of 0.3 mm is 0.1 %. Enters poses from markers, new markers and the map (:func:`scale_of_map`).
     marker_size_std: float = 0.003
@@ -58,6 +52,12 @@ class SystematicErrors:
     aspect_left: FloatArray | None = None
 
 
+#: Distance over which the error of the corners stays the same [share of the image's width]: a lens model is wrong by a
+#: smooth function. On the same board lengths of 0.1 to 0.25 fit, 0.5 leaves NEES 1.1, 1.0 leaves 1.25.
+CORNER_LENGTH = 0.25
+#: Corners [px] where one hypothesis is weighed against another. Enters the weights of views of new markers, the choice
+#: between two poses, and weights by the map.
+DECISION_PX = 0.1
 #: 99.9 % quantile of chi square with eight degrees of freedom, of a view of a marker.
 CHI2_OF_VIEW = 26.1
 #: Errors of successive poses by two cameras last as long as the view, for seconds: this many count as one.
@@ -222,7 +222,7 @@ def information_of_followed_map(information: FloatArray, bridges: BoolArray) -> 
 # Weights of markers, and decisions between hypotheses; no published covariance has these in it.
 
 
-def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors) -> FloatArray:
+def map_weights(noise: FloatArray, pixels: FloatArray) -> FloatArray:
     """Weights (N,) of markers whose map errors are ``pixels`` (N,) [px] in the present view.
 
     They depend on each marker alone and change as slowly as the view. With covariances relative to the best marker in
@@ -232,7 +232,7 @@ def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors)
     ----------
     noise : (N,) standard deviation of the corners [px]
     """
-    own = noise**2 + errors.decision_px**2
+    own = noise**2 + DECISION_PX**2
     return np.asarray(own / (own + pixels**2))
 
 
@@ -250,14 +250,14 @@ def survey_for_weights(of_survey: FloatArray, noise: FloatArray, errors: Systema
     return np.asarray((noise**2 / (noise**2 + errors.corner_px**2))[:, None, None] * of_survey)
 
 
-def decision_weights(noise: FloatArray, errors: SystematicErrors) -> FloatArray:
+def decision_weights(noise: FloatArray) -> FloatArray:
     """Factors (N,) on weights of markers with corner ``noise`` (N,) [px] that add the bias for decisions."""
-    return np.asarray(noise**2 / (noise**2 + errors.decision_px**2))
+    return np.asarray(noise**2 / (noise**2 + DECISION_PX**2))
 
 
-def with_corner_errors(covariances: FloatArray, errors: SystematicErrors) -> FloatArray:
+def with_corner_errors(covariances: FloatArray) -> FloatArray:
     """Corner covariances (..., 2, 2) [px^2] for decisions between hypotheses: noise and bias."""
-    return np.asarray(covariances + errors.decision_px**2 * np.eye(2))
+    return np.asarray(covariances + DECISION_PX**2 * np.eye(2))
 
 
 # Helpers.

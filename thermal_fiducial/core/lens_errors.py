@@ -11,7 +11,7 @@ from zlib import crc32
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import DRAWS, SystematicErrors
+from thermal_fiducial.core.error_model import CORNER_LENGTH, DRAWS, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -24,10 +24,10 @@ _LEAST_INDEPENDENT = 1e-6
 
 
 class LensErrors:
-    """Errors of the lens model at n corners (..., 2) [px]; ``errors`` gives size and length of the process."""
+    """Errors of the lens model at n corners (..., 2) [px]; ``errors`` gives their size."""
 
     def __init__(self, corners: FloatArray, camera: Camera, errors: SystematicErrors) -> None:
-        length = errors.corner_length * camera.width
+        length = CORNER_LENGTH * camera.width
         columns, rows = (
             _modes(corners[..., axis], size, length) for axis, size in ((0, camera.width), (1, camera.height))
         )

@@ -14,7 +14,7 @@ from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, preinteg
 from thermal_fiducial.calibration.rig_state import first_state, imu_errors
 from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.error_model import SystematicErrors
+from thermal_fiducial.core.error_model import CORNER_LENGTH, SystematicErrors
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.errors import InputError
@@ -346,7 +346,7 @@ def test_poses_alone_say_nothing_of_the_readout_time():
 def wrongly_calibrated(frames, camera, rng):
     """Frames and camera with one draw of what is declared of lens, focal length and sides, alike in all frames."""
     errors = SystematicErrors()
-    lens = drawn_lens(rng, errors.corner_px, length=errors.corner_length)
+    lens = drawn_lens(rng, errors.corner_px, length=CORNER_LENGTH)
     K, size = camera.K.copy(), 1.0 + errors.marker_size_std * rng.normal()
     K[:2, :2] *= 1.0 + errors.focal_length_std * rng.normal()
     wrong = []

@@ -10,6 +10,7 @@ from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import (
     arms_of_scale,
     assumed_draws,
+    CORNER_LENGTH,
     covariance_by_draws,
     drawn_sum,
     DRAWS,
@@ -31,7 +32,7 @@ ERRORS = SystematicErrors(CornerBias().px)
 def root_of_field(corners, errors):
     """(n, n) root of the covariance of the errors of corners (n, 2), of either axis [px]."""
     squared = np.sum((corners[:, None] - corners) ** 2, axis=-1)
-    correlations = np.exp(-0.5 * squared / (errors.corner_length * CAMERA.width) ** 2)
+    correlations = np.exp(-0.5 * squared / (CORNER_LENGTH * CAMERA.width) ** 2)
     return errors.corner_px * np.linalg.cholesky(correlations + 1e-7 * np.eye(len(corners)))
 
 

@@ -145,7 +145,7 @@ class JointFit:
 
     def decisive_weights(self, found: Location) -> FloatArray:
         """Weights (N,) of the markers against odometry: with the bias of corners, and residuals above their claims."""
-        relative = found.weights / found.weights.max() * decision_weights(self.sight.noise_px, self.model)
+        relative = found.weights / found.weights.max() * decision_weights(self.sight.noise_px)
         _, chi2 = self._weighted(found.reprojection, relative)
         return np.asarray(relative / noise_factor(chi2, 8 * len(relative) - 6))
 
@@ -216,7 +216,7 @@ class JointFit:
         extent = np.ptp(self.sight.observed.corners[heavy], axis=(0, 1)) / self.camera.focal_px
         if math.hypot(*extent) > WIDE or not np.any(apart):
             return None
-        starts, weights = hypotheses[apart], found.weights * decision_weights(self.sight.noise_px, self.model)
+        starts, weights = hypotheses[apart], found.weights * decision_weights(self.sight.noise_px)
         (T, other), chi2, _ = self.fit.solve(np.stack([T, starts[0]]), weights, inlier=np.inf)
         scale = noise_factor(float(chi2[0]), 8 * len(weights) - 6)
         if rotation_angle(T[:3, :3].T @ other[:3, :3]) > SAME_POSE and self._shown_from(other):
@@ -244,7 +244,7 @@ class JointFit:
         # A third of the variance is along each axis; a corner is 0.7 sides from the centre.
         apart = variances[:, :3].sum(axis=-1) / 3.0 + sight.sizes**2 * variances[:, 3:].sum(axis=-1) / 9.0
         distances = np.linalg.norm(sight.T_map_marker[:, :3, 3] - T_map_camera[:3, 3], axis=-1)
-        return map_weights(sight.noise_px, self.camera.focal_px * np.sqrt(apart) / distances, self.model)
+        return map_weights(sight.noise_px, self.camera.focal_px * np.sqrt(apart) / distances)
 
 
 class SurveyedFit(JointFit):

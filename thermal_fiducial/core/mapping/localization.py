@@ -12,7 +12,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import covariance_of_one_error, decision_weights, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, screw_difference
+from thermal_fiducial.core.geometry.reprojection import difference, screw_difference
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
 from thermal_fiducial.core.mapping.joint_fit import Alternative, JointFit, SurveyedFit
 from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
@@ -111,14 +111,6 @@ def _widened(found: Location, other: Alternative) -> Location:
     return _with_spread(found, covariance_of_one_error(apart, math.sqrt(share)))
 
 
-def _with_other(found: Location, other: CameraPose, excess: float) -> Location:
-    """A location that may be the ``other`` one, whose chi square is larger by ``excess``: the spread of the two."""
-    T, T_other = found.pose.T_map_camera, other.T_map_camera
-    odds, to_found = 1.0 / (1.0 + math.exp(0.5 * excess)), lever_arm(T[:3, 3] - T_other[:3, 3])
-    of_other = odds * to_found @ other.covariance @ to_found.T
-    return _with_spread(found, covariance_of_one_error(screw_difference(T_other, T), math.sqrt(odds)) + of_other)
-
-
 def _with_spread(found: Location, spread: FloatArray) -> Location:
     """A location that may be another one, at a covariance that is larger by ``spread`` (6, 6)."""
     pose = replace(found.pose, covariance=found.pose.covariance + spread)
@@ -126,10 +118,10 @@ def _with_spread(found: Location, spread: FloatArray) -> Location:
 
 
 def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPose | None) -> Location | Refusal:
-    """The likelier of two poses that the corners allow by the last frame, with the other one.
+    """The one of two poses that the corners allow which the last frame shows to be right.
 
-    Without a last frame the map learns nothing from it, and the pose is the mean of both: the filter, which has gravity
-    and follows both over time, finds the two in it.
+    Where none does, the map learns nothing from the frame, and the pose is the mean of both: the filter, which has
+    gravity and follows both over time, finds the two in it.
     """
     T = other.T_map_camera
     second = frame.refined(T, frame.sight.reprojected(frame.camera, T), found.weights)
@@ -138,12 +130,10 @@ def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPo
         return found
     if last is not None:
         excess = other.excess + _cost_of_turn(second.pose, last) - _cost_of_turn(found.pose, last)
-        likelier, less_likely = (found, second) if excess > 0.0 else (second, found)
         if abs(excess) > DECISIVE:
-            return likelier
-        return _with_other(likelier, less_likely.pose, abs(excess))
+            return found if excess > 0.0 else second
     chi2 = frame.fit.costs(np.stack([found.pose.T_map_camera, second.pose.T_map_camera]))
-    chi2 *= decision_weights(frame.sight.noise_px, frame.model).min()
+    chi2 *= decision_weights(frame.sight.noise_px).min()
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
     likelier, less_likely = (found, second) if chi2[0] <= chi2[1] else (second, found)
     pose = _mean(likelier, less_likely)

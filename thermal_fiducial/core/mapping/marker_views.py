@@ -150,7 +150,7 @@ class MarkerViews:
         covariances = np.stack([view.corner_covariances for view in views])
         self._noise = block_diagonal(covariances)
         #: with the bias of the corners, for weights and decisions
-        self._uncertain = block_diagonal(with_corner_errors(covariances, SystematicErrors()))
+        self._uncertain = block_diagonal(with_corner_errors(covariances))
         self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
         self._camera_noise = np.stack([view.viewpoint.covariances for view in views])
         self._of_sides = np.stack([view.viewpoint.of_sides for view in views])
