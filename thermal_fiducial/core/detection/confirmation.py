@@ -7,7 +7,7 @@ by the evidence of the fit of their pattern, or like the others.
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corners.corner_errors import BLURRED_OUT, RefinedCorners
+from thermal_fiducial.core.detection.corners.corner_errors import BLURRED_OUT
 from thermal_fiducial.core.detection.corners.refining import RefinedMarkers
 from thermal_fiducial.core.detection.finding.quads import halfway, halved
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
@@ -93,15 +93,12 @@ def _readable(
     reading = _read(frame.image, corners, tails, decoder)
     known = expected & reading.clear(config.guided_min_correlation, config.guided_min_margin)
     still = np.sqrt(np.sum(blur.spread**2, axis=1)) < _LITTLE / decoder.cells * sides_px(corners)
-    clear = still & (frame.displayed | _sharp(markers.observed))
+    # Neither blur nor noise shows that a pattern might differ by.
+    sharp = markers.observed.noise < BLURRED_OUT * np.abs(markers.observed.contrast)
+    clear = still & (frame.displayed | sharp)
     similar = np.abs(reading.correlation) >= np.where(clear, _SIMILAR_IF_CLEAR, _SIMILAR)
     distinct = (similar | (decoder.correctable >= _MANY_BITS)) & _stands_out(reading, decoder)
     return np.asarray((reading.ids == markers.ids) & (known | distinct))
-
-
-def _sharp(refined: RefinedCorners) -> BoolArray:
-    """Which markers (N,) show neither blur nor noise that a pattern might differ by."""
-    return np.asarray(refined.noise < BLURRED_OUT * np.abs(refined.contrast))
 
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:

@@ -43,10 +43,6 @@ class PlanarPoses:
         """
         return np.asarray(self.chi2[:, 1] <= _AMBIGUOUS * np.maximum(self.chi2[:, 0], 2.0))
 
-    def swapped(self, which: BoolArray) -> 'PlanarPoses':
-        """The poses with the branches of the markers ``which`` (N,) swapped."""
-        return self.ordered(np.array([which, ~which], dtype=np.intp).T)
-
     def ordered(self, branches: IntArray) -> 'PlanarPoses':
         """The poses with the branches in the order (N, 2)."""
         rows = np.arange(len(branches))[:, None]
@@ -127,7 +123,8 @@ def choose_branches(
     likeness = np.sum(poses.T_camera_marker[known, :, :3, :3] * expected[:, None], axis=(-1, -2))
     nearer = np.zeros(len(ambiguous), dtype=bool)
     nearer[known] = likeness[:, 1] > likeness[:, 0]
-    return poses.swapped(nearer & ambiguous)
+    swapped = (nearer & ambiguous).astype(np.intp)
+    return poses.ordered(np.array([swapped, 1 - swapped]).T)
 
 
 class CameraFit:

@@ -99,7 +99,7 @@ def test_other_known_markers_choose_the_branch():
     covs = np.broadcast_to(16.0 * ISOTROPIC, (3, 4, 2, 2))
     poses = solve_marker_poses(corners, covs, np.full(3, 0.2), camera)
     assert poses.ambiguous().all()
-    wrong = poses.swapped(np.array([True, False, True]))
+    wrong = poses.ordered(np.array([[1, 0], [0, 1], [1, 0]]))
     known, points = np.stack(poses_in_map), ImagePoints.at(corners, camera)
     sizes = np.full(3, 0.2)
     for predicted in (None, T_camera_map, wrong.T_camera_marker[0, 0] @ se3.inverse(poses_in_map[0])):

@@ -99,7 +99,9 @@ def refine_corners(
     reach = np.full((len(corners.px), 2, 4), np.inf) if reach is None else reach
     free = free_distance(sides, blur.across)
     inside, outside = (np.minimum(free, reach[:, part].reshape(-1, 1)) for part in (0, 1))
-    modelled, outward = model(sides, blur, inside, outside), sides.within_columns(outside)
+    modelled = model(sides, blur, inside, outside)
+    # No farther than columns reach.
+    outward = np.minimum(outside, (len(sides.distance) // 2) * np.abs(sides.normal).max(axis=2))
     measured, displaced_px = _measured(counts, modelled, sides, blur, outward, motion_px)
     segments, shows = with_gradients(measured, sides, widest)
     refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)), displaced_px)

@@ -78,10 +78,6 @@ class Sides:
     #: (E, 2, 2) where they begin and end [px]
     ends: FloatArray
 
-    def within_columns(self, distance: FloatArray) -> FloatArray:
-        """The distances from the sides (E, m), no longer than columns reach [px]."""
-        return np.asarray(np.minimum(distance, (len(self.distance) // 2) * np.abs(self.normal).max(axis=2)))
-
 
 def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, columns: int, blur_px: float) -> Sides:
     """Sides of quadrilaterals (N, 4, 2) in normalised coordinates.

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.geometry.reprojection import grown, squared_sides
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, TINY
+from thermal_fiducial.core.types import Float32Array, FloatArray, Gray, TINY
 
 # Window of the local standard deviation, at a quarter of the resolution: 68 px, a marker at working distance.
 _LOCAL = 17
@@ -165,20 +165,10 @@ def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray, edge_px: floa
     large = (sides >= min_side_px).all(axis=1)
     if not large.any():
         return np.zeros((0, 4, 2))
-    return _clockwise(_at_edges(found[large], sides[large].mean(axis=1), np.array(spots)[large], edge_px))
-
-
-def _at_edges(quads: FloatArray, sides: FloatArray, spots: BoolArray, edge_px: float) -> FloatArray:
-    """Quadrilaterals (Q, 4, 2) with mean ``sides`` (Q,), ``edge_px`` outside their outlines if ``spots`` (Q,).
-
-    Outlines of holes run through the region around them: their edges lie inside.
-    """
-    factor = 1.0 + 2.0 * edge_px * np.where(spots, 1.0, -1.0) / sides
-    return grown(quads, factor[:, None, None])
-
-
-def _clockwise(quads: FloatArray) -> FloatArray:
-    """Quadrilaterals in the order in which a clock's hand passes their corners, seen with v downward."""
-    diagonal, other = quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]
+    # Outlines of holes run through the region around them: their edges lie inside.
+    outward = np.where(np.array(spots)[large], 1.0, -1.0)
+    factor = 1.0 + 2.0 * edge_px * outward / sides[large].mean(axis=1)
+    edges = grown(found[large], factor[:, None, None])
+    diagonal, other = edges[:, 2] - edges[:, 0], edges[:, 3] - edges[:, 1]
     turned = diagonal[:, 0] * other[:, 1] - diagonal[:, 1] * other[:, 0] < 0.0
-    return np.where(turned[:, None, None], quads[:, ::-1], quads)
+    return np.where(turned[:, None, None], edges[:, ::-1], edges)
