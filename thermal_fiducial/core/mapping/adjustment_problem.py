@@ -28,10 +28,6 @@ class Priors:
     T: FloatArray
     information: FloatArray
 
-    def moved(self, T_new_old: FloatArray) -> 'Priors':
-        """Those of a frame that lies at ``T_new_old`` (4, 4), a small transform."""
-        return Priors(T_new_old @ self.T, self.information)
-
     def divided(self, factor: float) -> 'Priors':
         """Those whose covariances are this, once divided by a ``factor`` of all variances of an adjustment."""
         return Priors(self.T, factor * self.information)
@@ -243,7 +239,8 @@ class MapProblem:
         arms = T_map_marker[:, :3, 3] - state.T_map_camera[self.frame, :3, 3]
         to_camera = -lever_arm(arms).swapaxes(-1, -2)
         J_odometry = lever_arm(self.odometry.T[:, :3, 3] @ state.T_map_odometry[:3, :3].T)
-        of_cameras = self.odometry.moved(state.T_map_odometry).apart(state.T_map_camera)
+        by_odometry = Priors(state.T_map_odometry @ self.odometry.T, self.odometry.information)
+        of_cameras = by_odometry.apart(state.T_map_camera)
         of_markers = self.known.apart(state.T_map_marker)
         of_lens = float(self.lens_information * state.lens @ state.lens)
         return Linearised(state, r, J, to_camera, J_odometry, chi2, *of_cameras, *of_markers, of_lens)

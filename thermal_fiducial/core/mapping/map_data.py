@@ -160,8 +160,8 @@ class MarkerMap:
         if not markers:
             return rows
         T = np.stack([marker.T_map_marker for marker in markers])
-        _fill(rows, 'xyz', T[:, :3, 3])
-        _fill(rows, ('qx', 'qy', 'qz', 'qw'), quaternion_from_rotation(T[:, :3, :3]))
+        rows['x'], rows['y'], rows['z'] = T[:, :3, 3].T
+        rows['qx'], rows['qy'], rows['qz'], rows['qw'] = quaternion_from_rotation(T[:, :3, :3]).T
         variances = np.stack([marker.covariance for marker in markers])[:, [0, 1, 2], [0, 1, 2]]
         rows['sigma_m'] = np.sqrt(np.maximum(np.mean(variances, axis=1), 0.0))
         rows['rms_px'] = [marker.reprojection_error_px for marker in markers]
@@ -209,11 +209,6 @@ def gauge(markers: list[MapMarker]) -> BoolArray:
     if markers and not np.any(chosen):
         chosen[int(np.argmin([np.trace(m.covariance) for m in markers]))] = True
     return chosen
-
-
-def _fill(rows: np.ndarray, names: Collection[str], values: FloatArray) -> None:
-    for name, column in zip(names, values.T, strict=True):
-        rows[name] = column
 
 
 @dataclass(frozen=True)

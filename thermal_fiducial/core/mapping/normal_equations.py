@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -70,7 +70,7 @@ class NormalEquations:
             matrix = coupling.schur(node) if dense else self._sparse_schur(cross, node)
             free = np.flatnonzero(np.repeat(~self._held, 6))
             own = matrix[free][:, free]
-            factor: _Factor = _DenseFactor.of(own) if dense else _SparseFactor.of(own)
+            factor = _DenseFactor.of(own) if dense else _SparseFactor.of(own)
             return BorderedSystem.of(ReducedSystem(root, coupling, matrix, factor, self._held), blocks.common)
         except (RuntimeError, ValueError, np.linalg.LinAlgError):
             return None
@@ -125,25 +125,9 @@ class Coupling:
         return matrix
 
 
-class _Factor(Protocol):
-    """A factorised positive definite matrix (m, m) of nodes."""
-
-    def solve(self, sides: FloatArray) -> FloatArray:
-        """Solutions (m, K)."""
-        ...
-
-    def drawn(self, normal: FloatArray) -> FloatArray:
-        """Draws (m, K) of errors whose covariance is the inverse, by ``normal`` (m, K) of independent variables."""
-        ...
-
-    def covariances(self) -> FloatArray:
-        """Blocks (m / 6, 6, 6) on the diagonal of the inverse."""
-        ...
-
-
 @dataclass(frozen=True)
 class _DenseFactor:
-    """By the inverse of its Cholesky factor."""
+    """A factorised positive definite matrix (m, m) of nodes, by the inverse of its Cholesky factor."""
 
     root: FloatArray
 
@@ -153,19 +137,22 @@ class _DenseFactor:
         return cls(inverse_of_triangular(np.asarray(np.linalg.cholesky(S))))
 
     def solve(self, sides: FloatArray) -> FloatArray:
+        """Solutions (m, K)."""
         return np.asarray(self.root.T @ (self.root @ sides))
 
     def drawn(self, normal: FloatArray) -> FloatArray:
+        """Draws (m, K) of errors whose covariance is the inverse, by ``normal`` (m, K) of independent variables."""
         return np.asarray(self.root.T @ normal)
 
     def covariances(self) -> FloatArray:
+        """Blocks (m / 6, 6, 6) on the diagonal of the inverse."""
         roots = self.root.T.reshape(-1, 6, len(self.root))
         return np.asarray(roots @ np.swapaxes(roots, -1, -2))
 
 
 @dataclass(frozen=True)
 class _SparseFactor:
-    """By sparse triangular ones."""
+    """The same by sparse triangular factors."""
 
     factors: Any
 
@@ -210,7 +197,7 @@ class ReducedSystem:
     coupling: Coupling
     #: (6 M, 6 M) Schur complement, sparse in large maps, and its part of the free nodes
     matrix: Any
-    factor: _Factor
+    factor: _DenseFactor | _SparseFactor
     #: (M,)
     held: BoolArray
 
