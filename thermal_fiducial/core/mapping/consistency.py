@@ -248,19 +248,15 @@ def inconsistent(disagrees: np.ndarray, markers: Sequence[MapMarker]) -> np.ndar
         return disagrees
     a, b = np.flatnonzero(trusted).tolist()
     blamed = disagrees & ~trusted
-    preference = _preference(markers[a], markers[b])
-    if preference:
-        blamed[b if preference > 0 else a] = True
+    blamed[a], blamed[b] = _better_known(markers[b], markers[a]), _better_known(markers[a], markers[b])
     return np.asarray(blamed)
 
 
-def _preference(a: MapMarker, b: MapMarker) -> int:
-    """1 if ``a`` is preferred to ``b``, -1 the other way round, 0: neither; by survey, then by observations."""
-    if a.fixed != b.fixed:
-        return 1 if a.fixed else -1
-    if a.observations > 4 * b.observations:
-        return 1
-    return -1 if b.observations > 4 * a.observations else 0
+def _better_known(marker: MapMarker, other: MapMarker) -> bool:
+    """Whether ``marker`` is preferred to the ``other`` one, by survey, then by observations."""
+    if marker.fixed != other.fixed:
+        return marker.fixed
+    return marker.observations > 4 * other.observations
 
 
 def _is_back(misplaced: MisplacedMarker, pose: CameraPose, predicted: PredictedCamera | None) -> bool:
