@@ -51,8 +51,6 @@ def confirmed(
     config: ArucoDetectorConfig,
 ) -> RefinedMarkers:
     """The markers ``found`` that show their pattern at the refined corners and are squares."""
-    if len(found.ids) == 0:
-        return markers
     corners = markers.observed.corners_px
     there = found.places.at.px + markers.blur.shift
     off_cells = np.abs(corners - there).max(axis=(1, 2)) * decoder.cells / sides_px(there)

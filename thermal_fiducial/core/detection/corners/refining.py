@@ -70,12 +70,6 @@ class RefinedMarkers(Stacked):
     #: of the camera, corrected by the corners
     twist: Twist | None
 
-    @staticmethod
-    def none(frame: Frame) -> 'RefinedMarkers':
-        """No markers."""
-        found, corners = FoundMarkers.none(), RefinedCorners.none()
-        return RefinedMarkers(found.ids, corners, MotionBlur.none(0), corners, found.places, frame.twist)
-
 
 def refine(
     frame: Frame, found: FoundMarkers, track: MotionTrack, scale: GrayScale, decoder: Decoder
@@ -89,7 +83,8 @@ def refine(
     decoder : of the dictionary
     """
     if len(found.ids) == 0:
-        return RefinedMarkers.none(frame), scale
+        corners = RefinedCorners.none()
+        return RefinedMarkers(found.ids, corners, MotionBlur.none(0), corners, found.places, frame.twist), scale
     clear = np.abs(found.cnr).min() > CLEAR_CNR
     columns = OF_CLEAR if clear else OF_FAINT
     twist, places = frame.twist, found.places

@@ -163,8 +163,6 @@ class MarkerFinder:
         blind = self._search.search(frame, allowed, config, found, scales, kinds)
         possible = (blind.cnr[:, None] * kinds > 0.0).any(axis=1)
         ids, corners = blind.ids[possible], blind.corners_px[possible]
-        if len(ids) == 0:
-            return FoundMarkers.none()
         at, sizes = ImagePoints.at(corners, frame.camera), known.sizes[ids]
         depth = depths(ippe_square(at.x, sizes)[:, 0], sizes)
         if in_map is not None:

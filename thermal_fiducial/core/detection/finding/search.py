@@ -61,11 +61,6 @@ class Outlines(NamedTuple):
     corners_px: FloatArray
     cnr: FloatArray
 
-    @staticmethod
-    def none() -> 'Outlines':
-        """No markers."""
-        return Outlines(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros(0))
-
 
 class BlindSearch:
     """Finds the markers of the dictionary of a ``decoder`` anywhere in a frame."""
@@ -106,16 +101,12 @@ class BlindSearch:
             masks = (self._faint.mask(near if kind > 0.0 else -near, 0.5 * frame.noise, clear=clear) for kind in kinds)
             outlines = [find_quads(mask, 0.5 * config.min_side_px + 2.0, halfway(hidden)) for mask in masks]
             faint = 2.0 * np.concatenate(outlines) + 0.5
-        if len(fine) + len(faint) == 0:
-            return Outlines.none()
         # A search at full resolution alone is for clear markers, which need no alignment.
         pull = SearchScales.FAINT in scales
         reading, quads = self._read(frame, half, (fine, faint), allowed, found.ids if pull else None)
         good = accepted(reading, frame.noise, self._decoder.correctable, config)
         good &= (squared_sides(quads) >= min_side_px**2).all(axis=1)
         good &= (frame.camera.contains(quads, CUT_OFF_PX) & frame.camera.shows(quads)).all(axis=1)
-        if not good.any():
-            return Outlines.none()
         good &= ~overlapped(reading, quads, good, distinct(reading, frame.noise, config))
         chosen = _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), frame.noise)
         return chosen._replace(corners_px=large_aligned(frame.image, chosen.corners_px, chosen.ids, self._decoder))
