@@ -116,7 +116,7 @@ MECHANISMS = {
     'lens in the errors of the map': Mechanism(
         ('bent corridor', 'wall'),
         ('error_sources:LensErrors',),
-        {'error_sources:ErrorSources._by_lenses': _no_lens},
+        {'error_sources:ErrorSources._by_lens': _no_lens},
     ),
     'joint draws of the map': Mechanism(
         ('bent corridor', 'wall', 'uneven map'),

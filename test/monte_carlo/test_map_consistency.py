@@ -23,12 +23,12 @@ def one_map(seed):
         rows = see(T, poses, sigma, rng)
         ids = rows['id'].astype(np.int64)
         start = retract(T, 0.01 * rng.normal(size=6))
-        frames.append(Keyframe(k, start, CAMERA, ids, corners_px(rows), corner_covariances(rows)))
+        frames.append(Keyframe(k, start, ids, corners_px(rows), corner_covariances(rows)))
     markers = {
         i: MapMarker(i, SIZE, i == 0, T if i == 0 else retract(T, 0.01 * rng.normal(size=6)), (i > 0) * np.eye(6))
         for i, T in poses.items()
     }
-    refinement = refine(snapshot_of(markers, frames, {}, 0, NO_SYSTEMATIC_ERRORS))
+    refinement = refine(snapshot_of(markers, frames, CAMERA, {}, 0, NO_SYSTEMATIC_ERRORS))
     nees = []
     for i in range(1, 8):
         d = difference(poses[i], refinement.markers[i].T_map_marker)

@@ -301,6 +301,16 @@ class ImagePoints(Stacked):
         return ImagePoints(px, self.x + (self.inverse @ (px - self.px)[..., None])[..., 0], self.J, self.inverse)
 
 
+def by_other_calibration(
+    px: FloatArray, covariances: FloatArray, before: Camera, now: Camera
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels (..., 2) and covariances (..., 2, 2) [px^2] ``now`` of directions by the calibration of ``before``."""
+    at = ImagePoints.at(px, before)
+    uv, J = now.distort_linearised(at.x)
+    gain = J @ at.inverse
+    return uv, gain @ covariances @ gain.swapaxes(-1, -2)
+
+
 def _least_root(polynomial: Polynomial) -> float:
     """Smallest positive real root; inf if there is none."""
     if not np.isfinite(polynomial.coef).all():

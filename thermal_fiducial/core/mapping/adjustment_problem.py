@@ -54,9 +54,8 @@ class Snapshot:
     #: (F,) of the keyframes, and (F, 4, 4) T_map_camera
     stamps_ns: IntArray
     T_map_camera: FloatArray
-    #: calibrations of the cameras, and (F,) which of them took each keyframe
-    cameras: tuple[Camera, ...]
-    camera: IntArray
+    #: calibration, in whose pixels all views are
+    camera: Camera
     #: priors of the camera poses by odometry
     odometry: Priors
     #: of each view, in the order of the keyframes: (n,) index of the keyframe, (n,) ID of the marker, corners
@@ -170,16 +169,13 @@ class MapProblem:
     #: (M,) markers that never move, and those that carry the scale
     held: BoolArray
     anchors: BoolArray
-    cameras: tuple[Camera, ...]
+    camera: Camera
     frame: IntArray
     marker: IntArray
-    camera: IntArray
     corners: FloatArray
     W: FloatArray
     images: Images
-    #: the calibration with the most views, whose aspect ratio is estimated: (n, 8, 1) whitened corners by one standard
-    #: deviation of it
-    lens: int
+    #: (n, 8, 1) whitened corners by one standard deviation of the aspect ratio
     J_lens: FloatArray
     odometry: Priors
     known: Priors
@@ -197,12 +193,9 @@ class MapProblem:
         if np.all(held):
             return None
         T_map_marker = np.stack([m.T_map_marker for m in markers])
-        used, camera = np.unique(snapshot.camera[frames][frame], return_inverse=True)
-        cameras = tuple(snapshot.cameras[place] for place in used.tolist())
+        camera = snapshot.camera
         corners, W = snapshot.corners[views], whitening(snapshot.covariances[views])
-        lens = int(np.argmax(np.bincount(camera)))
-        J_lens = W @ of_aspect(corners, cameras[lens], snapshot.errors)[..., None]
-        J_lens = np.where((camera == lens)[:, None, None], J_lens.reshape(-1, 8, 1), 0.0)
+        J_lens = (W @ of_aspect(corners, camera, snapshot.errors)[..., None]).reshape(-1, 8, 1)
         return cls(
             start=Poses(snapshot.T_map_camera[frames], T_map_marker, np.zeros(J_lens.shape[-1])),
             ids=marker_ids.tolist(),
@@ -210,14 +203,12 @@ class MapProblem:
             sizes=np.array([m.size for m in markers]),
             held=held,
             anchors=gauge(markers),
-            cameras=cameras,
+            camera=camera,
             frame=frame,
             marker=marker,
-            camera=camera,
             corners=corners,
             W=W,
-            images=_images(cameras, camera, corners, W),
-            lens=lens,
+            images=Images.of(ImagePoints.at(corners, camera), W),
             J_lens=J_lens,
             odometry=Priors(snapshot.odometry.T[frames], snapshot.odometry.information[frames]),
             known=_known(snapshot, marker_ids, T_map_marker),
@@ -285,7 +276,6 @@ class MapProblem:
             self,
             frame=self.frame[views],
             marker=self.marker[views],
-            camera=self.camera[views],
             corners=self.corners[views],
             W=self.W[views],
             images=Images(self.images.whitening[views], self.images.target[views]),
@@ -364,16 +354,6 @@ class MapProblem:
 def _with_odometry(of_markers: FloatArray, of_frames: FloatArray) -> FloatArray:
     """Those of M markers (M, ...), and last the sum over the keyframes (F, ...): (M + 1, ...)."""
     return np.concatenate([of_markers, np.sum(of_frames, axis=0, keepdims=True)])
-
-
-def _images(cameras: tuple[Camera, ...], camera: IntArray, corners: FloatArray, W: FloatArray) -> Images:
-    """Whitened images of n views, each by its ``camera`` (n,), without the distortion of the lenses."""
-    whitened = Images(np.empty_like(W), np.empty_like(corners))
-    for index, calibration in enumerate(cameras):
-        own = camera == index
-        images = Images.of(ImagePoints.at(corners[own], calibration), W[own])
-        whitened.whitening[own], whitened.target[own] = images.whitening, images.target
-    return whitened
 
 
 def _known(snapshot: Snapshot, ids: IntArray, T_map_marker: FloatArray) -> Priors:

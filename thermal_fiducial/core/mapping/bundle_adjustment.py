@@ -192,7 +192,7 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
         now.cost(_scale(now.chi2)) / widened,
         inconsistent,
         snapshot.map_revision,
-        FoundAspect(problem.cameras[problem.lens], float(now.state.lens[0]), left),
+        FoundAspect(problem.camera, float(now.state.lens[0]), left),
     )
 
 

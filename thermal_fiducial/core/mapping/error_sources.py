@@ -64,7 +64,7 @@ class ErrorSources:
         covariances += scale_of_map(arms_of_scale(positions, positions[problem.anchors]), errors)
         draws = by_corners.nodes + by_noise + by_held.nodes
         found = by_corners.common + np.sqrt(widened) * common + by_held.common
-        aspect = LensErrors(problem.corners[:1], problem.cameras[problem.lens], errors).aspect_draws
+        aspect = LensErrors(problem.corners[:1], problem.camera, errors).aspect_draws
         return MapErrors(covariances, draws[:-1], aspect - found[0])
 
     def variance_of_aspect(self, widened: float, errors: SystematicErrors) -> float:
@@ -73,13 +73,9 @@ class ErrorSources:
         of_cameras = np.swapaxes(now.to_camera, -1, -2) @ moved.frames[problem.frame]
         gains = self._by_corners(problem.J_lens - now.J @ (moved.nodes[problem.marker] + of_cameras))
         of_shapes = np.sum(problem.over_markers(gains) ** 2, axis=(1, 2, 3)) @ self._shapes(errors) ** 2
-        of_lenses = 0.0
-        for index, camera in enumerate(problem.cameras):
-            own = problem.camera == index
-            lens = LensErrors(problem.corners[own], camera, errors)
-            of_lenses += lens.covariance(gains[own].reshape(-1, 1, 2)).item()
+        of_lens = LensErrors(problem.corners, problem.camera, errors).covariance(gains.reshape(-1, 1, 2)).item()
         noise = widened * self._noise_of_common[0, 0]
-        return float(self.system.covariance[0, 0] ** 2 * (of_shapes + of_lenses) + noise)
+        return float(self.system.covariance[0, 0] ** 2 * (of_shapes + of_lens) + noise)
 
     @property
     def _noise_of_common(self) -> FloatArray:
@@ -98,8 +94,8 @@ class ErrorSources:
         # What is common has its part of each keyframe's views, too.
         J_frame = np.concatenate([now.J @ np.swapaxes(now.to_camera, -1, -2), problem.J_lens], axis=-1)
         of_frames, of_markers = self._by_corners(J_frame), self._by_corners(now.J)
-        frames = self._by_lenses(of_frames, problem.frame, len(problem.stamps), errors)
-        nodes = self._by_lenses(of_markers, problem.marker, len(problem.ids), errors)
+        frames = self._by_lens(of_frames, problem.frame, len(problem.stamps), errors)
+        nodes = self._by_lens(of_markers, problem.marker, len(problem.ids), errors)
         # Each marker has one shape, and a keyframe many markers.
         nodes += np.swapaxes(problem.over_markers(of_markers), 1, 2).reshape(len(nodes), 6, 8) @ shapes
         of_views = np.swapaxes(of_frames, 1, 2).reshape(len(of_frames), -1, 8)
@@ -108,15 +104,12 @@ class ErrorSources:
             frames[frame] += drawn_sum(of_views[views], shapes[problem.marker[views]])
         return Vectors(frames[:, :6], np.concatenate([nodes, np.zeros_like(nodes[:1])]), frames[:, 6:].sum(axis=0))
 
-    def _by_lenses(self, gains: FloatArray, of: IntArray, count: int, errors: SystematicErrors) -> FloatArray:
-        """Draws (count, m, K) by the lenses, of what has derivatives (n, 4, m, 2): sums over views ``of`` (n,) each."""
-        problem, result = self.problem, np.zeros((count, gains.shape[2], DRAWS))
-        for index, camera in enumerate(problem.cameras):
-            own = np.flatnonzero(problem.camera == index)
-            own = own[np.argsort(of[own], kind='stable')]
-            some, starts = np.unique(of[own], return_index=True)
-            lens = LensErrors(problem.corners[own], camera, errors)
-            result[some] += lens.drawn_sums(gains[own].reshape(4 * len(own), -1, 2), 4 * starts)
+    def _by_lens(self, gains: FloatArray, of: IntArray, count: int, errors: SystematicErrors) -> FloatArray:
+        """Draws (count, m, K) by the lens, of what has derivatives (n, 4, m, 2): sums over views ``of`` (n,) each."""
+        order, result = np.argsort(of, kind='stable'), np.zeros((count, gains.shape[2], DRAWS))
+        some, starts = np.unique(of[order], return_index=True)
+        lens = LensErrors(self.problem.corners[order], self.problem.camera, errors)
+        result[some] = lens.drawn_sums(gains[order].reshape(4 * len(order), -1, 2), 4 * starts)
         return result
 
     def _by_corners(self, J: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from thermal_fiducial.core.error_model import (
     information_of_followed_map,
     SystematicErrors,
 )
-from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.camera import by_other_calibration, Camera
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
@@ -40,7 +40,6 @@ class Keyframe:
 
     stamp_ns: int
     T_map_camera: FloatArray
-    camera: Camera
     #: (k,)
     ids: IntArray
     #: (k, 4, 2) [px]
@@ -57,21 +56,19 @@ class Keyframe:
 def snapshot_of(
     markers: Mapping[int, MapMarker],
     frames: Sequence[Keyframe],
+    camera: Camera,
     known: Mapping[int, tuple[FloatArray, FloatArray]],
     map_revision: int,
     errors: SystematicErrors,
 ) -> Snapshot:
     """At least one keyframe, and ``markers`` of the map to adjust, as a refinement works on them."""
-    cameras = {id(frame.camera): frame.camera for frame in frames}
-    places = {key: place for place, key in enumerate(cameras)}
     information = np.stack([frame.information for frame in frames])
     bridges = np.array([frame.bridge for frame in frames])
     return Snapshot(
         markers,
         np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
         np.stack([frame.T_map_camera for frame in frames]),
-        tuple(cameras.values()),
-        np.array([places[id(frame.camera)] for frame in frames]),
+        camera,
         Priors(np.stack([frame.T_odometry for frame in frames]), information_of_followed_map(information, bridges)),
         np.repeat(np.arange(len(frames)), [len(frame.ids) for frame in frames]),
         np.concatenate([frame.ids for frame in frames]),
@@ -140,6 +137,7 @@ class KeyframeStore:
         self._adjustment = LastAdjustment(markers=len(marker_map.markers))
         #: frames that were ever added
         self._added = 0
+        #: in whose pixels all keyframes are
         self._camera: Camera | None = None
         #: stamp of the last frame with known markers [ns]; None: not yet
         self._last_ns: int | None = None
@@ -204,7 +202,7 @@ class KeyframeStore:
 
     def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int) -> Snapshot | None:
         """Input of an adjustment, with about ``views`` views of markers at most; None without keyframes."""
-        if not self.frames:
+        if not self.frames or self._camera is None:
             return None
         markers = len(marker_map.markers)
         frames = self._selected(views)
@@ -213,7 +211,7 @@ class KeyframeStore:
         trusted = {key: marker for key, marker in marker_map.markers.items() if marker.trusted}
         observed_ids = set(np.concatenate([frame.ids for frame in frames]).tolist())
         priors = prior_poses({key: marker for key, marker in self._before.items() if key in observed_ids})
-        return snapshot_of(trusted, frames, priors, marker_map.revision, errors)
+        return snapshot_of(trusted, frames, self._camera, priors, marker_map.revision, errors)
 
     def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
         """Take over adjusted poses by stamp; other keyframes move with the nearest adjusted one in time."""
@@ -231,15 +229,23 @@ class KeyframeStore:
     def _keyframe(
         self, observed: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None
     ) -> Keyframe:
-        if self._camera is None or not camera.matches(self._camera):
-            self._camera = camera
-        frame = Keyframe(
-            pose.stamp_ns, pose.T_map_camera, self._camera, observed.ids, observed.corners, observed.covariances
-        )
+        if self._camera is not None and self.frames and not camera.matches(self._camera):
+            self._carry_over(self._camera, camera)
+        self._camera = camera
+        frame = Keyframe(pose.stamp_ns, pose.T_map_camera, observed.ids, observed.corners, observed.covariances)
         if predicted is None:
             return frame
         information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
         return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
+
+    def _carry_over(self, before: Camera, now: Camera) -> None:
+        """Give all keyframes the pixels that their directions have by another calibration."""
+        frames = list(self.frames.values())
+        px, covariances = np.concatenate([f.corners for f in frames]), np.concatenate([f.covariances for f in frames])
+        px, covariances = by_other_calibration(px, covariances, before, now)
+        ends = np.cumsum([len(frame.ids) for frame in frames])[:-1]
+        for frame, corners, own in zip(frames, np.split(px, ends), np.split(covariances, ends), strict=True):
+            self.frames[frame.stamp_ns] = replace(frame, corners=corners, covariances=own)
 
     def _selected(self, views: int) -> tuple[Keyframe, ...]:
         """Keyframes with about ``views`` views of markers at most, spread over the map like all of them."""

@@ -17,7 +17,7 @@ from thermal_fiducial.core.error_model import (
     SystematicErrors,
     with_corner_errors,
 )
-from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.camera import by_other_calibration, Camera
 from thermal_fiducial.core.geometry.reprojection import linearise, marker_corners
 from thermal_fiducial.core.geometry.rigid_fit import minimise, Quadratic, SINGULAR
 from thermal_fiducial.core.lens_errors import LensErrors
@@ -102,10 +102,7 @@ class MarkerView:
 
     def in_pixels_of(self, before: Camera, now: Camera) -> 'MarkerView':
         """The same directions in pixels of the camera's calibration ``now``, where it was that of ``before``."""
-        at = ImagePoints.at(self.corners, before)
-        corners, J = now.distort_linearised(at.x)
-        gain = J @ at.inverse
-        covariances = gain @ self.corner_covariances @ np.swapaxes(gain, -1, -2)
+        corners, covariances = by_other_calibration(self.corners, self.corner_covariances, before, now)
         return replace(self, corners=corners, corner_covariances=covariances)
 
     def moved(self, T_new_old: FloatArray) -> 'MarkerView':

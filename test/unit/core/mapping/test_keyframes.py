@@ -4,7 +4,7 @@ from dataclasses import replace
 import time
 
 import numpy as np
-from support.walls import CAMERA, flight
+from support.walls import flight
 
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore
@@ -12,7 +12,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 
 
 def frame(stamp, T):
-    return Keyframe(stamp, T, CAMERA, np.array([1, 2]), np.zeros((2, 4, 2)), np.zeros((2, 4, 2, 2)))
+    return Keyframe(stamp, T, np.array([1, 2]), np.zeros((2, 4, 2)), np.zeros((2, 4, 2, 2)))
 
 
 def test_the_budget_is_kept_however_long_the_flight():

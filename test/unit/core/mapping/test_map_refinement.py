@@ -32,7 +32,7 @@ class Recorded:
     errors: SystematicErrors = NO_SYSTEMATIC_ERRORS
 
     def snapshot(self):
-        return snapshot_of(self.markers, self.keyframes, self.known, self.map_revision, self.errors)
+        return snapshot_of(self.markers, self.keyframes, CAMERA, self.known, self.map_revision, self.errors)
 
 
 def refine(recorded):
@@ -40,9 +40,7 @@ def refine(recorded):
 
 
 def keyframe(stamp, T_map_camera, rows):
-    return Keyframe(
-        stamp, T_map_camera, CAMERA, rows['id'].astype(np.int64), corners_px(rows), corner_covariances(rows)
-    )
+    return Keyframe(stamp, T_map_camera, rows['id'].astype(np.int64), corners_px(rows), corner_covariances(rows))
 
 
 def snapshot(rng, poses, sigma=0.02, count=30, disturbance=0.01, fixed=(0,)):
@@ -114,7 +112,7 @@ def test_the_schur_complement_answers_like_the_whole_system(fixed):
                 H[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] += J_i.T @ J_j
 
     T_map_camera, T_map_marker = problem.start.T_map_camera[problem.frame], problem.start.T_map_marker[problem.marker]
-    _, *J_px = linearise(problem.cameras[0], T_map_camera, T_map_marker, problem.sizes[problem.marker])
+    _, *J_px = linearise(problem.camera, T_map_camera, T_map_marker, problem.sizes[problem.marker])
     whitened = [(problem.W @ J.reshape(-1, 4, 2, 6)).reshape(-1, 8, 6) for J in J_px]
     for v, (J_camera, J_marker) in enumerate(zip(*whitened, strict=True)):
         w = np.sqrt(e.weights(1.0)[v])
