@@ -30,7 +30,6 @@ from thermal_fiducial.core.detection.partial.grid import (
 from thermal_fiducial.core.detection.partial.visible_cells import VisibleCells
 from thermal_fiducial.core.detection.patterns import CELL_SAMPLES, Decoder, most_similar, NEAR_CELLS
 from thermal_fiducial.core.detection.prediction.frame import Frame
-from thermal_fiducial.core.detection.prediction.known_markers import PartialMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import marker_corners
@@ -86,7 +85,7 @@ class PartialMarkerSearch:
         self,
         frame: Frame,
         scale: GrayScale,
-        candidates: PartialMarkers,
+        candidates: list[tuple[int, FloatArray, float]],
         unsure_m: float,
         config: ArucoDetectorConfig,
     ) -> tuple[IntArray, RefinedCorners]:
@@ -95,17 +94,13 @@ class PartialMarkerSearch:
         Parameters
         ----------
         frame : whose twist is known
+        candidates : of :meth:`KnownMarkers.partially_visible`
         scale : of the display, as far as whole markers have shown it; counts have none
         unsure_m : standard deviation of the predicted camera position [m]
         """
         if frame.displayed:
             frame = frame.in_counts(scale.counts)
-        in_view = (
-            self._expected(frame.camera, marker_id, size, T, unsure_m)
-            for marker_id, T, size in zip(
-                candidates.ids.tolist(), candidates.T_camera_marker, candidates.sizes.tolist(), strict=True
-            )
-        )
+        in_view = (self._expected(frame.camera, key, size, T, unsure_m) for key, T, size in candidates)
         largest = sorted((marker for marker in in_view if marker is not None), key=lambda marker: -marker.cell_px)
         ids, found = list[int](), RefinedCorners.none()
         for marker in largest[:_MOST]:

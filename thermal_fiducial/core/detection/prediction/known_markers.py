@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -93,17 +92,6 @@ def depths(T_camera_marker: FloatArray, sizes: FloatArray) -> FloatArray:
     return np.fmax(np.where(np.isfinite(depth), depth, 1.0), LEAST_DEPTH)
 
 
-class PartialMarkers(NamedTuple):
-    """N markers that face the camera and are partially in view by prediction."""
-
-    #: (N,)
-    ids: IntArray
-    #: (N, 4, 4)
-    T_camera_marker: FloatArray
-    #: (N,) sides [m]
-    sizes: FloatArray
-
-
 class KnownMarkers:
     """The markers of a map.
 
@@ -149,8 +137,13 @@ class KnownMarkers:
         x, depth = points[..., :2] / points[..., 2:], points[..., 2]
         return ExpectedMarkers(self.ids[others][visible], x, depth, np.zeros(len(visible)))
 
-    def partially_visible(self, T_camera_map: FloatArray, camera: Camera, without: IntArray) -> PartialMarkers:
-        """Markers that face the camera and are partially in view, except the IDs ``without``."""
+    def partially_visible(
+        self, T_camera_map: FloatArray, camera: Camera, without: IntArray
+    ) -> list[tuple[int, FloatArray, float]]:
+        """ID, T_camera_marker (4, 4) and side [m] of markers that face the camera and are partially in view.
+
+        Except the IDs ``without``.
+        """
         T = T_camera_map @ self.T_map_marker[self.ids]
         points = se3.apply(T_camera_map, self._corners_and_normals[:, :4].reshape(-1, 3))
         corners = camera.project(points).reshape(-1, 4, 2)
@@ -161,7 +154,7 @@ class KnownMarkers:
         whole = camera.contains(corners, _WHOLE_PX).all(axis=1)
         facing = _faces_camera(T[:, :3, 3], T[:, :3, 2])
         some = np.flatnonzero(facing & overlap & ~whole & ~among(self.ids, without))
-        return PartialMarkers(self.ids[some], T[some], self.sizes[self.ids[some]])
+        return list(zip(self.ids[some].tolist(), T[some], self.sizes[self.ids[some]].tolist(), strict=True))
 
 
 def _faces_camera(centre: FloatArray, normal: FloatArray) -> BoolArray:
