@@ -152,18 +152,16 @@ class FrameCleaner:
         used = int(np.bitwise_or.reduce(sample, axis=None))
         lowest = (used & -used).bit_length() - 1
         if 0 <= lowest < _SHIFTED or used >> bits:
-            self._believe_shift(lowest if lowest >= _SHIFTED else 0)
+            # A frame that stands alone with another shift is not believed.
+            shown = lowest if lowest >= _SHIFTED else 0
+            self._other_shift = self._other_shift + 1 if shown != self._shift else 0
+            if self._other_shift >= _FRAMES_WITH_SHIFT:
+                self._shift, self._other_shift = shown, 0
         if self._shift:
             counts = counts >> np.uint16(self._shift)
         elif used >> bits and self._carrying < _FRAMES_WITH_CARRIES:
             self._carrying = self._carrying + 1 if _carries(sample, bits) else 0
         return np.bitwise_and(counts, np.uint16((1 << (16 if self._carrying else bits)) - 1), dtype=np.uint16)
-
-    def _believe_shift(self, shown: int) -> None:
-        """Take over the shift that a frame shows, unless the frame stands alone with it."""
-        self._other_shift = self._other_shift + 1 if shown != self._shift else 0
-        if self._other_shift >= _FRAMES_WITH_SHIFT:
-            self._shift, self._other_shift = shown, 0
 
     def _without_telemetry(self, frame: Counts | Gray, extra: int) -> Counts | Gray:
         """Without ``extra`` rows that carry no image, from the side where the picture breaks off."""
