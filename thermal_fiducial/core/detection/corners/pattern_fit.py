@@ -66,6 +66,9 @@ _SAME_PX, _SAME_BLUR = 0.1, 0.05
 _ALONE, _SAME_ALONE = 7.5, 0.2
 # Steps of an alignment. Damping: share of the information's diagonal that is added to it.
 _OF_ALIGNMENT, _DAMPING = 3, 0.1
+# Standard deviation of the shape of a predicted outline [cells]: a prediction that is 2 cm and 1 deg off makes a marker
+# a metre away 0.06 cells larger or smaller and turns it by 0.05. Its place may be anywhere.
+_SHAPE = 0.1
 # Blur of the pattern in an alignment, so wide that it reaches an edge half a cell away [cells].
 _WIDE = 0.25
 # Smoothing of the image for it, in pixels and at most in cells; least width of cells [px].
@@ -94,6 +97,8 @@ _SINGULAR = 1e-9
 # Displacement from where a marker was decoded up to which it was decoded there [cells].
 _NEAR = 0.1
 _EYE = np.eye(2)
+# What all corners (u of all, v of all) have in common, taken out.
+_WITHOUT_MEAN = np.kron(_EYE, np.eye(4) - 0.25)
 
 
 class _Prior(NamedTuple):
@@ -206,7 +211,16 @@ def fit_patterns(
     return PatternFit(quads, covariance, at.contrast, np.sqrt(_noise_variance(at, blur_px)), step, at)
 
 
-def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArray, decoder: Decoder) -> FloatArray:
+def aligned(
+    image: Float32Array,
+    quads: FloatArray,
+    ids: IntArray,
+    turns: IntArray,
+    decoder: Decoder,
+    steps: int = _OF_ALIGNMENT,
+    *,
+    predicted: bool = False,
+) -> FloatArray:
     """Inaccurate outlines (Q, 4, 2), moved to where the patterns of their markers are.
 
     The outline of a faint marker may have a corner or two wrong by up to a cell.
@@ -215,19 +229,39 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
     ----------
     image : (height, width) counts
     ids, turns : (Q,) markers, and the quarter turns in which the outlines show them
+    steps : number of them
+    predicted : whether the outlines are in the wrong place rather than of the wrong shape. Something that covers a part
+        of a marker then does not draw its corners there.
     """
     white, grid = decoder.patterns(ids, turns), pattern_grid(decoder.cells, _FEWEST, bent=True)
     cell = np.maximum(diagonals(quads) / (math.sqrt(2.0) * decoder.cells), _LEAST_CELL_PX)
     smoothing = min(_SMOOTHING_PX, _SMOOTHING * float(np.median(cell)))
     view = PatternView(np.asarray(cv2.GaussianBlur(image, (0, 0), smoothing), dtype=np.float32))
-    blur = wide = _WIDE * cell
-    for _ in range(_OF_ALIGNMENT):
+    start, blur = quads, _WIDE * cell
+    wide = blur
+    for _ in range(steps):
         at = linearised(view, quads, blur, white, grid)
-        information = at.information
+        information, gradient = at.information, _gradient(at)
+        if predicted:
+            _hold_shape(information, gradient, at, start, _SHAPE * cell)
         diagonal = np.einsum('qii->qi', information)
         diagonal *= 1.0 + _DAMPING
-        quads, blur = _moved(at, _step(_solvable(information), _gradient(at)), wide)
+        quads, blur = _moved(at, _step(_solvable(information), gradient), wide)
     return quads
+
+
+def _hold_shape(
+    information: FloatArray, gradient: FloatArray, at: PatternResiduals, start: FloatArray, std_px: FloatArray
+) -> None:
+    """Add to the normal equations (Q, K, K), (Q, K, 1) that outlines have the shapes of ``start`` (Q, 4, 2).
+
+    Where the model misses a cell, it misses all of its samples. ``std_px`` (Q,): of the shapes.
+    """
+    variance = _FEWEST**2 * (at.rest * at.rest).mean(axis=1, dtype=np.float64)
+    precision = (variance / std_px**2)[:, None, None] * _WITHOUT_MEAN
+    off = (at.corners_px - start).swapaxes(1, 2).reshape(-1, 8, 1)
+    information[:, CORNERS, CORNERS] += precision
+    gradient[:, CORNERS] += precision @ off
 
 
 def _noise_variance(at: PatternResiduals, blur_px: float) -> FloatArray:

@@ -235,7 +235,7 @@ def near_prediction(
     displaced = places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
     ids = expected.ids
     shown = _shifted(frame.image, ids, places.at.px + displaced, decoder)
-    shown = large_aligned(frame.image, shown, ids, decoder)
+    shown = large_aligned(frame.image, shown, ids, decoder, predicted=True)
     reading = decoder.read(frame.image, shown)
     limits = config.guided_min_correlation, config.guided_min_margin, config.guided_min_contrast * frame.noise
     good = (reading.ids == ids) & (reading.turns == 0) & reading.clear(*limits)

@@ -39,9 +39,13 @@ _PICTURE_SIDE = 0.25
 _EDGE_PX, _SHORTER_PX = 0.5, 2.0
 # Width of cells up to which blur merges borders and plates of any margin [px].
 _MERGED_PX = 3.0
-# Width of cells, once to twice as much, in the images in which large markers are aligned [px]: a third of a cell is so
-# little there that an alignment finds it, and what it leaves is less than the 5 px from which sides are found.
-_ALIGNED_PX = 6.0
+# Width of cells, once to twice as much, in the images in which large markers are aligned [px]: half a cell is so little
+# there that an alignment finds it, and what it leaves is less than the 5 px from which sides are found. Half a cell of
+# markers that are smaller than twice that is less anyway.
+_ALIGNED_PX = 5.0
+# Steps of their alignment: after three, one in 25 that begin half a cell away are still 3 to 6 px off, after five one
+# in 200.
+_STEPS = 5
 _NONE = np.zeros(0, dtype=np.intp)
 
 
@@ -147,11 +151,13 @@ class BlindSearch:
         return reading.joined(again), np.concatenate([quads, pulled])
 
 
-def large_aligned(image: Float32Array, corners: FloatArray, ids: IntArray, decoder: Decoder) -> FloatArray:
+def large_aligned(
+    image: Float32Array, corners: FloatArray, ids: IntArray, decoder: Decoder, *, predicted: bool = False
+) -> FloatArray:
     """Corners (N, 4, 2) of markers ``ids`` (N,), those of large ones moved to where their patterns are.
 
     Cells are read in their middles: outlines that are off by a quarter of a cell are as similar as right ones. Sides
-    are found from a few pixels away.
+    are found from a few pixels away. ``predicted``: of :func:`aligned`.
     """
     at, corners = corners, corners.copy()
     wider = np.maximum(sides_px(corners) / (_ALIGNED_PX * decoder.cells), 1.0)
@@ -161,7 +167,8 @@ def large_aligned(image: Float32Array, corners: FloatArray, ids: IntArray, decod
         which = np.flatnonzero(halvings == number)
         if len(which):
             upright = np.zeros(len(which), dtype=np.int64)
-            corners[which] += 2.0**number * (aligned(image, at[which], ids[which], upright, decoder) - at[which])
+            there = aligned(image, at[which], ids[which], upright, decoder, _STEPS, predicted=predicted)
+            corners[which] += 2.0**number * (there - at[which])
     return corners
 
 
