@@ -30,7 +30,8 @@ _SIMILAR, _SIMILAR_IF_CLEAR = 0.82, 0.92
 _CLEAR_MARGIN = 0.5
 _MANY_BITS = 3
 # Range of the step from border to surroundings over the contrast: white surroundings are about as white as white bits,
-# the background behind a plate's edge is not.
+# the background behind a plate's edge is not. By the fit of its sides, a whole marker has 0.84 to 1.06 of it, one of
+# which a tenth is covered seldom less than 0.57; where there are no sides, 7 of 10 fits have less than 0.3.
 _WHITE = (0.4, 1.75)
 # Distance from the image's border below which a marker, by its refined corners, counts as possibly cut off [px].
 _BORDER_PX = 1.0
@@ -96,7 +97,11 @@ def _readable(
     clear = still & (frame.displayed | sharp)
     similar = np.abs(reading.correlation) >= np.where(clear, _SIMILAR_IF_CLEAR, _SIMILAR)
     distinct = (similar | (decoder.correctable >= _MANY_BITS)) & _stands_out(reading, decoder)
-    return np.asarray((reading.ids == markers.ids) & (known | distinct))
+    # Where the fit found no sides, corners are where it began, and their covariance is that of its prior. What was not
+    # expected has passed limits of its surroundings before.
+    step = markers.observed.contrast * np.sign(reading.contrast)
+    on_sides = (step >= _WHITE[0] * np.abs(reading.contrast)) | ~expected
+    return np.asarray((reading.ids == markers.ids) & (known | distinct) & on_sides)
 
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:

@@ -6,12 +6,16 @@ import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.camera_frames import pixel_noise
+from thermal_fiducial.core.detection.confirmation import confirmed
+from thermal_fiducial.core.detection.corners.gray_scale import UNKNOWN_SCALE
+from thermal_fiducial.core.detection.corners.refining import refine
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.detection.finding.finder import near_prediction
 from thermal_fiducial.core.detection.finding.search import BlindSearch, overlapped, SearchScales
 from thermal_fiducial.core.detection.patterns import Decoder, Dictionary, Reading, sampled, shrunk
 from thermal_fiducial.core.detection.prediction.frame import Frame, Places
 from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers, FoundMarkers
+from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
 from thermal_fiducial.core.detection.prediction.twist import UNKNOWN_TWIST
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -321,3 +325,16 @@ def test_what_covers_a_corner_of_a_large_marker_does_not_draw_it_there(cell, rad
         assert found.ids.tolist() == [marker_id]
         # 1.8 px at most when written; up to 20 px before.
         assert np.abs(found.places.at.px[0] - corners).max() < FOUND_FROM_PX
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.parametrize(('off', 'count'), [(0.02, 1), (0.3, 0)])
+def test_an_expected_marker_has_sides_where_it_is_claimed(off, count, sign):
+    """Its cells read as well 14 px off; the fit found no sides there, and claimed the 3 px of its prior."""
+    image, corners = large_scene(7, 48, sign)
+    frame, yes = frame_of(image), np.ones(1, dtype=bool)
+    places = Places.of(ImagePoints.at(corners[None] + 48 * off, frame.camera), np.ones((1, 4)))
+    found = FoundMarkers(np.array([7]), places, np.array([200.0]), yes, ~yes)
+    config, track = ArucoDetectorConfig(), MotionTrack(np.eye(4), 0.0)
+    refined, _ = refine(frame, found, track, UNKNOWN_SCALE, DECODER)
+    assert len(confirmed(frame, found, refined, DECODER, config).ids) == count
