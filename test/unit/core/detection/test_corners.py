@@ -1,5 +1,7 @@
 """Corner refinement on images drawn from the model of a blurred pattern, under every lens model."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from support.pose_information import information_of_poses
 
 from thermal_fiducial.core.detection.corners.corner_errors import OF_SIDES_PX
 from thermal_fiducial.core.detection.corners.side_fit import refine_corners
+from thermal_fiducial.core.detection.prediction.frame import MotionBlur
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
@@ -97,6 +100,27 @@ def test_one_step_from_a_quarter_of_a_pixel_away_is_enough():
     found = refine(image, corners + 0.25, camera, 7)
     # As good as the last of several steps.
     assert np.abs(found.corners_px[0] - corners).max() < 0.02
+
+
+def test_a_square_is_one_at_one_instant():
+    """A turn of 1 rad/s while the rows are read in 16 ms shears the image by 529 px * 1 rad/s * 16 ms / 512 rows."""
+    camera, T = CAMERAS['plumb_bob'], marker_pose(1.5, (0.3, -0.25, 0.4))
+    image, corners = draw(camera, 7, T, 0.3)
+    shear, middle = 0.0165, 255.5
+    sheared = cv2.warpAffine(
+        image.astype(np.float32),
+        np.array([[1.0, shear, -shear * middle], [0.0, 1.0, 0.0]]),
+        (camera.width, camera.height),
+        flags=cv2.INTER_LANCZOS4,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    shift = np.stack([shear * (corners[:, 1] - middle), np.zeros(4)], axis=1)
+    motion = replace(MotionBlur.none(1), shift=shift[None])
+    found = refine(sheared, corners + shift, camera, 7, motion=motion)
+    # Otherwise the outline is inconsistent with a square, and its corners were doubted by 1.5 px.
+    assert found.doubt[0] == 0.0
+    # As without motion.
+    assert np.abs(found.corners_px[0] - corners - shift).max() < 0.02
 
 
 def test_corners_that_still_move_after_the_last_pass_claim_no_more_than_their_last_step():

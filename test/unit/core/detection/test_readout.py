@@ -2,9 +2,14 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.corners.gray_scale import UNKNOWN_SCALE
+from thermal_fiducial.core.detection.corners.refining import refine
+from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.prediction.frame import (
     delays,
     Frame,
@@ -12,9 +17,12 @@ from thermal_fiducial.core.detection.prediction.frame import (
     Places,
     rolling_displacement,
 )
+from thermal_fiducial.core.detection.prediction.known_markers import FoundMarkers
+from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
 from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.files.dictionary import load_dictionary
 
 CAMERA = Camera(640, 512, [[440.0, 0, 319.5], [0, 440.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
 TWIST = Twist(np.array([0.8, -1.5, 0.6, -1.8, 1.5, 0.8]), np.eye(6), np.array([3.0, 0.0, 2.0, 6.0, -4.0, 5.0]))
@@ -82,3 +90,31 @@ def test_rows_that_are_read_later_are_displaced_and_no_more_blurred(lag):
     motion = motion_blur(replace(FRAME, lag=lag), places, TWIST)
     assert (motion.to_tails is None) == (lag < 0.001)
     np.testing.assert_allclose(motion.lag, places.lag_blur(TWIST, lag), rtol=1e-12, atol=1e-12)
+
+
+def test_corners_of_rows_that_are_read_early_claim_what_the_twist_is_uncertain_by():
+    """A marker near the top of the image, at rest, by a twist that is known to 0.1 rad/s."""
+    decoder = Decoder(load_dictionary('DICT_4X4_50').bits)
+    image = np.full((512, 640), 7000.0)
+    cells = np.pad(decoder.patterns(np.array([7]), np.array([0]))[0], 1, constant_values=1.0)
+    image[28:124, 268:364] += 200.0 * np.kron(cells, np.ones((12, 12)))
+    image = cv2.GaussianBlur(image, (0, 0), 0.6) + np.random.default_rng(0).normal(0.0, 1.0, image.shape)
+    corners = np.array([279.5, 39.5]) + 72.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    camera, one = Camera(640, 512, [[440.0, 0, 319.5], [0, 440.0, 255.5], [0, 0, 1]]), np.ones(1, dtype=bool)
+    still = Twist(np.zeros(6), np.diag([0.0, 0.0, 0.0, 0.1, 0.1, 0.0]) ** 2)
+    frame = Frame(0, image.astype(np.float32), 1.0, camera, still, 0.0, 0.025, ArucoDetectorConfig().blur_px)
+    found = FoundMarkers(
+        np.array([7]),
+        Places.of(ImagePoints.at(corners[None], camera), np.ones((1, 4))),
+        np.array([200.0]),
+        one,
+        one,
+    )
+    track = MotionTrack(np.eye(4), 0.0)
+    refined, _ = refine(frame, found, track, UNKNOWN_SCALE, decoder)
+    std = np.sqrt(refined.corners.covariances[0].diagonal(axis1=1, axis2=2))
+    x, y = camera.normalise(corners).T
+    # Of turns about both axes of the image.
+    moved = 44.0 * np.sqrt([(x * y) ** 2 + (1.0 + x * x) ** 2, (x * y) ** 2 + (1.0 + y * y) ** 2])
+    # The noise of pixels adds 0.2 per cent.
+    np.testing.assert_allclose(std, (moved * np.abs(delays(corners[:, 1], frame))).T, rtol=0.01)

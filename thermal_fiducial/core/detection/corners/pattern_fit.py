@@ -151,7 +151,13 @@ def nearness(corners_px: FloatArray, cells: int, blurs_px: FloatArray) -> IntArr
 
 
 def fitted_patterns(
-    frame: Frame, found: FoundMarkers, start: ImagePoints, view: PatternView, nearer: int, decoder: Decoder
+    frame: Frame,
+    found: FoundMarkers,
+    start: ImagePoints,
+    rolling: FloatArray,
+    view: PatternView,
+    nearer: int,
+    decoder: Decoder,
 ) -> RefinedCorners:
     """Corners of N markers by their patterns, and of small ones what evidence of the markers these are.
 
@@ -159,12 +165,13 @@ def fitted_patterns(
     ----------
     found : (N,)
     start : (N, 4) corners in the image, accurate to half a cell
+    rolling : (N, 4, 2) what the rolling shutter displaces them by [px]
     view : the image; of raw counts, without lag tails
     nearer : of :func:`nearness`, the same for all
     """
     fit = fit_patterns(view, start.px, found.ids, decoder, frame.blur_px, nearer)
     # The two constraints of a square in space hold for them, too.
-    square = as_squares(start.at_pixels(fit.corners_px), np.zeros((len(found.ids), 8, 1)), fit.covariance)
+    square = as_squares(start.at_pixels(fit.corners_px - rolling), np.zeros((len(found.ids), 8, 1)), fit.covariance)
     floor = OF_DISPLAYED_PATTERN_PX if frame.displayed else OF_PATTERN_PX
     corners = fit.corners_px + square.moved.reshape(-1, 4, 2)
     doubt = square.doubt * squared_sides(corners).mean(axis=1)

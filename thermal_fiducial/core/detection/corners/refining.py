@@ -152,7 +152,7 @@ def _by_patterns(
         there, moving = start.only(which), blur.only(which)
         bends = lens_bends(there, frame.camera)
         view = PatternView(frame.image, moving.to_tails, moving.spread, None, frame.displayed, bends, saturation)
-        fitted = fitted_patterns(frame, found.only(which), there, view, nearer, decoder)
+        fitted = fitted_patterns(frame, found.only(which), there, moving.rolling, view, nearer, decoder)
         refined = refined.joined(fitted)
     return refined.only(_places(near))
 
@@ -193,11 +193,16 @@ def _at_stamp(
             ids, refined, blur, replace(refined, covariances=unsure), Places(at, places.depth, places.flow), None
         )
     lag_blur = places.lag_blur(twist, frame.lag)
-    rolling = rolling_displacement(places, twist, frame, (refined.corners_px + blur.removed)[..., 1])
+    rows = (refined.corners_px + blur.removed)[..., 1]
+    rolling = rolling_displacement(places, twist, frame, rows)
     px = refined.corners_px - lag_blur + blur.removed - rolling
     unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur, displayed=frame.displayed)
     if frame.twist is None:
         unknown = unknown + _of_unpredicted_motion(frame, places, refined, twist, cells)
+    elif frame.readout > 0.0:
+        # By a wrong twist rows are displaced the more, the farther they are from the middle one.
+        by_twist = delays(rows, frame)[..., None, None] * places.flow
+        unknown = unknown + by_twist @ twist.covariance @ by_twist.swapaxes(-1, -2)
     corners = replace(refined, corners_px=px, covariances=doubted + unknown)
     return RefinedMarkers(ids, refined, blur, corners, Places(at.at_pixels(px), places.depth, places.flow), twist)
 

@@ -87,8 +87,7 @@ def refine_corners(
     blur_px : standard deviation of optics and pixel
     columns : of pixels, in a segment
     motion : blur by motion; none when left out
-    reach : (N, 2, 4) distances inside and outside the sides up to which pixels count [px]; when left out, as far as
-        the cells allow
+    reach : (N, 2, 4) how far inside and outside the sides pixels count [px]; when left out, as far as cells allow
     """
     motion = motion or MotionBlur.none(len(corners.px))
     motion_px = np.hypot(motion.spread[:, 0], motion.spread[:, 1])
@@ -104,7 +103,8 @@ def refine_corners(
     outward = np.minimum(outside, (len(sides.distance) // 2) * np.abs(sides.normal).max(axis=2))
     measured, displaced_px = _measured(counts, modelled, sides, blur, outward, motion_px)
     segments, shows = with_gradients(measured, sides, widest)
-    refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)), displaced_px)
+    square = as_squares(corners.at_pixels(corners.px - motion.rolling), *adjust(sides, segments))
+    refined, moving = _moved(sides, segments, square, displaced_px)
     if passes == 1:
         return refined
     ending = ending_sides(counts, modelled, sides, measured, outward, blur.across, motion_px)

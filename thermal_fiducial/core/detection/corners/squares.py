@@ -64,7 +64,8 @@ def as_squares(at: ImagePoints, measured: FloatArray, covariance: FloatArray) ->
 
     Parameters
     ----------
-    at : (N, 4) initial corners
+    at : (N, 4) initial corners, without what a rolling shutter displaces them by: lag hardly changes the shape of a
+        square
     measured, covariance : (N, 8, 1), (N, 8, 8) displacements of the corners [px]
     """
     nearest = _corrected(at, _TOGETHER @ measured, measured, covariance)

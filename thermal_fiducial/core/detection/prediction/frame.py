@@ -267,6 +267,11 @@ class MotionBlur(Stacked):
     #: (N, 4, 2) mean displacement by the whole lag [px]
     lag: FloatArray
 
+    @property
+    def rolling(self) -> FloatArray:
+        """Displacement (N, 4, 2) of the corners by the rolling shutter alone [px]."""
+        return self.shift - self.lag + self.removed
+
     @staticmethod
     def none(count: int) -> 'MotionBlur':
         """Of ``count`` markers at rest."""
