@@ -177,12 +177,13 @@ IN_OPENCV_4_6 = """
     BORDER_REFLECT_101 BORDER_REPLICATE CAP_FFMPEG CAP_PROP_CONVERT_RGB CHAIN_APPROX_SIMPLE CMP_LT COLOR_GRAY2BGR CV_32F
     DIST_L2 DIST_LABEL_PIXEL DIST_MASK_5 FONT_HERSHEY_SIMPLEX GaussianBlur IMREAD_ANYDEPTH IMREAD_GRAYSCALE
     IMREAD_IGNORE_ORIENTATION IMREAD_UNCHANGED INTER_AREA INTER_CUBIC INTER_LANCZOS4 INTER_LINEAR MORPH_CLOSE MORPH_OPEN
-    REDUCE_AVG REDUCE_SUM RETR_LIST Sobel TERM_CRITERIA_EPS TERM_CRITERIA_MAX_ITER VideoCapture WARP_INVERSE_MAP
+    REDUCE_AVG REDUCE_SUM RETR_LIST Sobel TERM_CRITERIA_EPS TERM_CRITERIA_MAX_ITER TM_CCOEFF_NORMED VideoCapture
+    WARP_INVERSE_MAP
     __version__ absdiff addWeighted approxPolyDP arcLength aruco.getPredefinedDictionary blur circle compare contourArea
     convertScaleAbs convexHull copyMakeBorder cvtColor distanceTransformWithLabels error fillConvexPoly
     findContours fisheye.projectPoints fisheye.undistortPoints getNumThreads getPerspectiveTransform imdecode
-    imreadmulti medianBlur morphologyEx polylines projectPoints putText reduce remap resize setNumThreads subtract
-    warpAffine
+    imreadmulti matchTemplate medianBlur morphologyEx polylines projectPoints putText reduce remap resize setNumThreads
+    split subtract warpAffine warpPerspective
 """
 
 

@@ -1,6 +1,7 @@
 """Markers of a frame: predicted, found, refined, confirmed, both poses of each."""
 
 from collections.abc import Collection, Mapping
+import math
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses, solve_marker_poses
 from thermal_fiducial.core.geometry.reprojection import corners_of_faces
-from thermal_fiducial.core.measurements import marker_rows, Markers, whole_ns
+from thermal_fiducial.core.measurements import CameraPose, marker_rows, Markers, whole_ns
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
@@ -86,9 +87,10 @@ class MarkerDetector:
         camera.require_size_of(counts)
         config, known, history = self.config, self._known, self._history
         prediction = predict_frame(stamp_ns, prior, history.track, config.time_offset_std)
-        T_camera_map = prediction.T_camera_map
+        pose = prediction.pose
+        T_camera_map = None if pose is None else se3.inverse(pose.T_map_camera)
         # By which known markers are looked for.
-        guide = T_camera_map if config.guided and len(known.ids) else None
+        guide = pose if config.guided and len(known.ids) else None
         keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
         frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)
         found, history = self._finder.find(frame, history, known, guide, config)
@@ -102,7 +104,7 @@ class MarkerDetector:
             poses = self._poses(ids, corners.covariances, at, T_camera_map)
         rows = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
         if guide is not None and among(ids, known.ids).sum() < _ENOUGH_WHOLE:
-            rows = self._with_partial(rows, frame, scale, guide, prediction.position_std_m)
+            rows = self._with_partial(rows, frame, scale, guide)
         # A twist by corners of which none was confirmed as a marker's is dropped.
         twist = refined.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], known.sizes[ids])
@@ -118,12 +120,11 @@ class MarkerDetector:
         poses = planar_poses(at, covariances, sizes)
         return choose_branches(poses, at, covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
 
-    def _with_partial(
-        self, rows: Markers, frame: Frame, scale: GrayScale, T_camera_map: FloatArray, position_std_m: float
-    ) -> Markers:
-        """The rows of whole markers, and those of known ones that are partially visible."""
-        found_ids = rows['id'].astype(np.int64)
+    def _with_partial(self, rows: Markers, frame: Frame, scale: GrayScale, guide: CameraPose) -> Markers:
+        """The rows of whole markers, and those of known ones that are partially visible from the ``guide``."""
+        found_ids, T_camera_map = rows['id'].astype(np.int64), se3.inverse(guide.T_map_camera)
         candidates = self._known.partially_visible(T_camera_map, frame.camera, found_ids)
+        position_std_m = math.sqrt(np.trace(guide.covariance[:3, :3]))
         ids, corners = self._partial.look(frame, scale, candidates, position_std_m, self.config)
         if len(ids) == 0:
             return rows

@@ -136,6 +136,10 @@ class Decoder:
         #: (M,) which markers show a pose
         self.posed = ~turned_alike(bits)
         self._patterns = patterns.astype(np.float32)
+        #: number of bits of a marker
+        self.bits = int(self._inner.sum())
+        border = self._inner @ self._detrend
+        self._border = border / np.linalg.norm(border)
         share = ((np.arange(self.cells)[:, None] + CELL_SAMPLES) / self.cells).ravel()
         self._samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share))).astype(np.float32)
         self._beside_sides = _beside_sides(self.cells)
@@ -191,6 +195,18 @@ class Decoder:
         values = self._contrasts(sampled(image, seen_between(quads, self._samples)))
         spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), np.float32(TINY))
         return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread, dtype=np.float64)
+
+    def evidence(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
+        """Log-likelihood ratios (Q,) of upright markers ``ids`` (Q,) in quadrilaterals (Q, 4, 2).
+
+        Over squares with a border and anything else inside: a share below r of their variance is left by the pattern
+        with a probability of the order of r^(v/2), where v is the number of bits.
+        """
+        values = self._contrasts(sampled(image, seen_between(quads, self._samples))).astype(np.float64)
+        size = (values * values).sum(axis=1)
+        by_marker, by_border = (values * self._patterns[4 * ids]).sum(axis=1), values @ self._border
+        left, of_bits = size - by_marker**2, size - by_border**2
+        return np.asarray(0.5 * self.bits * np.log(np.maximum(of_bits, TINY) / np.maximum(left, TINY)))
 
     def patterns(self, ids: IntArray, turns: IntArray) -> FloatArray:
         """Cells (Q, m, m), 1 for white, as quadrilaterals show markers whose corners they name ``turns`` late."""

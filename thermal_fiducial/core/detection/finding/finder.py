@@ -12,6 +12,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.gray_scale import GrayScale, UNKNOWN_SCALE
 from thermal_fiducial.core.detection.corners.refining import CLEAR_CNR
+from thermal_fiducial.core.detection.finding.drifted import drifted_markers
 from thermal_fiducial.core.detection.finding.search import BlindSearch, large_aligned, SearchScales
 from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
 from thermal_fiducial.core.detection.prediction.frame import Frame, Places, rolling_displacement
@@ -27,7 +28,9 @@ from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
 from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
-from thermal_fiducial.core.geometry.reprojection import diagonals
+from thermal_fiducial.core.geometry.reprojection import diagonals, sides_px, turned
+from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS
 
 # Polarity: memory in frames that show markers, and the surplus of markers of one polarity from which on it is certain.
@@ -41,6 +44,9 @@ _ENOUGH = 0.5
 # Longest time between blind searches [s] without a map or with a wrong prediction: every other frame at 30 Hz, every
 # one of slow cameras, before which a marker passes in few frames.
 _UNSURE_S = 0.06
+# Markers of the map that are looked for away from their predictions: how many at a time, least width of their cells
+# [px], and how far, as a share of the image's width.
+_MOST, _LEAST_CELL_PX, _FARTHEST = 8, 1.0, 0.25
 # Least correlation with its pattern of a followed marker, in an image that lag blurs.
 _STILL_SIMILAR = 0.5
 
@@ -97,18 +103,18 @@ class MarkerFinder:
         frame: Frame,
         history: FrameHistory,
         known: KnownMarkers,
-        T_camera_map: FloatArray | None,
+        guide: CameraPose | None,
         config: ArucoDetectorConfig,
     ) -> tuple[FoundMarkers, FrameHistory]:
         """Markers at the frame's stamp, accurate to a pixel or two, and the history with the blind search after it.
 
-        ``T_camera_map`` (4, 4): by which the map's markers are predicted; None: they are not.
+        ``guide``: camera by which the map's markers are predicted; None: they are not.
         """
         in_map: ExpectedMarkers | None = None
         if frame.twist is None or not config.guided:
             found, complete, holds = FoundMarkers.none(), False, False
         else:
-            found, number, in_map = self._guided(frame, frame.twist, history, known, T_camera_map, config)
+            found, number, in_map = self._guided(frame, frame.twist, history, known, guide, config)
             complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
             enough = complete or (number > 0 and len(found.ids) >= _ENOUGH * number)
             holds = in_map is not None and enough
@@ -116,8 +122,11 @@ class MarkerFinder:
         if (complete or holds) and history.searched_within(frame.stamp_ns, period):
             return found, history
         scales = _next_scales(history, found, complete=complete)
-        blind = self._blind(frame, history, found, scales, known, in_map, config)
-        return found.and_elsewhere(blind), replace(history, searched_ns=frame.stamp_ns, scales=scales)
+        found = found.and_elsewhere(self._blind(frame, history, found, scales, known, in_map, config))
+        if not holds and in_map is not None and guide is not None and frame.twist is not None:
+            missing = in_map.only(~among(in_map.ids, found.ids))
+            found = found.and_elsewhere(self._drifted(frame, frame.twist, missing, guide, history, config))
+        return found, replace(history, searched_ns=frame.stamp_ns, scales=scales)
 
     def _guided(
         self,
@@ -125,7 +134,7 @@ class MarkerFinder:
         twist: Twist,
         history: FrameHistory,
         known: KnownMarkers,
-        T_camera_map: FloatArray | None,
+        guide: CameraPose | None,
         config: ArucoDetectorConfig,
     ) -> tuple[FoundMarkers, int, ExpectedMarkers | None]:
         """Markers found at their predictions, from the last frame, else from the map.
@@ -139,8 +148,8 @@ class MarkerFinder:
             last, places = last.only(wanted), places.only(wanted)
         found, in_map = followed(frame, twist, last, places, self._decoder, config), None
         lost = ~among(last.ids, found.ids)
-        if T_camera_map is not None:
-            in_map = known.expected(T_camera_map, frame.camera, config.min_side_px, without=found.ids)
+        if guide is not None:
+            in_map = known.expected(inverse(guide.T_map_camera), frame.camera, config.min_side_px, without=found.ids)
             lost &= ~among(last.ids, known.ids)
         missing = last.only(lost) if in_map is None else in_map.joined(last.only(lost))
         number = len(found.ids) + len(missing.ids)
@@ -176,6 +185,38 @@ class MarkerFinder:
             places = Places.of(ImagePoints.at(corners - rolling, frame.camera), depth)
         no = np.zeros(len(ids), dtype=bool)
         return FoundMarkers(ids, places, blind.cnr[possible], no, no)
+
+    def _drifted(
+        self,
+        frame: Frame,
+        twist: Twist,
+        missing: ExpectedMarkers,
+        guide: CameraPose,
+        history: FrameHistory,
+        config: ArucoDetectorConfig,
+    ) -> FoundMarkers:
+        """Those of the ``missing`` markers that are together farther from their predictions by the ``guide``."""
+        places = Places.of(ImagePoints.seen_at(missing.x, frame.camera), missing.depth)
+        cells = sides_px(places.at.px) / self._decoder.cells
+        # The widest ones are the most distinct.
+        tried = np.argsort(-cells, kind='stable')[: min(_MOST, int((cells >= _LEAST_CELL_PX).sum()))]
+        if len(tried) == 0:
+            return FoundMarkers.none()
+        missing, places = missing.only(tried), places.only(tried)
+        displaced = places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
+        shown, corners = drifted_markers(
+            frame.image,
+            missing.ids,
+            places.at.px + displaced,
+            places.flow.mean(axis=1),
+            turned(guide.covariance, guide.T_map_camera[:3, :3].T),
+            _FARTHEST * frame.camera.width,
+            history.polarities(config.polarity),
+            self._decoder,
+        )
+        x = ImagePoints.at(corners - displaced, frame.camera).x
+        again = replace(missing, x=x).only(shown)
+        return near_prediction(frame, twist, again, self._decoder, config) if shown.any() else FoundMarkers.none()
 
     def allowed(self, known: KnownMarkers, config: ArucoDetectorConfig) -> BoolArray:
         """Which IDs of the dictionary may be found: of those that show a pose."""

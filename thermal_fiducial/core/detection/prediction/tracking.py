@@ -21,6 +21,7 @@ from thermal_fiducial.core.detection.prediction.twist import (
 from thermal_fiducial.core.error_model import UNKNOWN_ACCELERATION
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import twist_transfer
+from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS, Stacked
 
@@ -172,10 +173,8 @@ class FramePrediction:
 
     #: of the camera; None: unknown
     twist: Twist | None
-    #: (4, 4); None without recent odometry
-    T_camera_map: FloatArray | None
-    #: standard deviation of the camera's position in it [m]
-    position_std_m: float
+    #: by recent odometry; None without
+    pose: CameraPose | None
 
 
 def predict_frame(
@@ -188,7 +187,7 @@ def predict_frame(
     time_offset_std : standard deviation of the clock offset before the filter has estimated it [s]
     """
     if prior is None:
-        return FramePrediction(track.predict(stamp_ns), None, math.inf)
+        return FramePrediction(track.predict(stamp_ns), None)
     lag_ns = max(round(SECOND_NS * track.lag), _SHORTEST_LAG_NS)
     odometry_ns = stamp_ns + prior.offset_ns
     clock_std_s = 0.0 if prior.clock_is_known else time_offset_std
@@ -199,14 +198,13 @@ def predict_frame(
         states = [other]
     twist = track.predict(stamp_ns)
     if not states or abs(odometry_ns - states[-1].stamp_ns) >= _STALE_NS:
-        return FramePrediction(twist, None, math.inf)
+        return FramePrediction(twist, None)
     by_odometry = twist_by_odometry(odometry_ns, states, twist_transfer(track.T_body_camera), track.lag, clock_std_s)
     # That of a filter which is lost says less than the markers of the last frames, or than nothing.
     if np.trace(by_odometry.covariance) < np.trace((twist or UNKNOWN_TWIST).covariance):
         twist = by_odometry
     if twist is None:
-        return FramePrediction(None, None, math.inf)
+        return FramePrediction(None, None)
     nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns))
     dt = (odometry_ns - nearest.stamp_ns) / SECOND_NS
-    pose = extrapolated(nearest, dt, stamp_ns, track.T_body_camera, clock_std_s).pose
-    return FramePrediction(twist, se3.inverse(pose.T_map_camera), math.sqrt(np.trace(pose.covariance[:3, :3])))
+    return FramePrediction(twist, extrapolated(nearest, dt, stamp_ns, track.T_body_camera, clock_std_s).pose)
