@@ -15,7 +15,7 @@ from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.marker_map import load_map
-from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.parameter_sections import load_sections
 from thermal_fiducial.files.reading import is_text, is_there, naming, one_line, read_text, require_folder
 from thermal_fiducial.files.writing import unfinished
 from thermal_fiducial.report.output_bag import read_output, RecordedOutput
@@ -61,7 +61,7 @@ class Run:
     true_map: MarkerMap | None = None
     #: t_imu - t_camera as configured
     offset_ns: int = 0
-    #: how the images were read
+    #: how the images were read; the defaults where that is unknown
     front_end: Tau2CameraConfig = field(default_factory=Tau2CameraConfig)
 
 
@@ -91,7 +91,10 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
     if true_map is None and truth is not None:
         beside = _folder_of(truth) / TRUE_MAP
         true_map = beside if beside.exists() else None
-    offset_ns = _camera_time_offset_ns(path / PARAMETERS)
+    sections = load_sections(path / PARAMETERS) if (path / PARAMETERS).exists() else None
+    with naming(path / PARAMETERS):
+        offset_ns = 0 if sections is None else _camera_time_offset_ns(sections)
+        front_end = from_mapping(Tau2CameraConfig, (sections or {}).get('/tau2_camera', {}))
     return Run(
         path=path,
         fused=read_tum(path / FUSED),
@@ -105,7 +108,7 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
         truth_path=truth,
         true_map=None if true_map is None else load_map(true_map),
         offset_ns=offset_ns,
-        front_end=_front_end(path / PARAMETERS),
+        front_end=front_end,
     )
 
 
@@ -135,28 +138,12 @@ def bag_options(summary: dict[str, Any]) -> dict[str, Any]:
     return {'remap': summary.get('remaps', {}), 'second_camera': summary.get('second_camera', '')}
 
 
-def _camera_time_offset_ns(path: Path) -> int:
+def _camera_time_offset_ns(sections: dict[str, dict[str, Any]]) -> int:
     """t_imu - t_camera that the filter was given."""
-    if not path.exists():
-        return 0
     try:
-        return round(float(_parameters_of('pose_ekf', path)['camera_time_offset']) * SECOND_NS)
+        return round(float(sections['/pose_ekf']['camera_time_offset']) * SECOND_NS)
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise InputError(f'{path}: no camera_time_offset of pose_ekf in it') from None
-
-
-def _front_end(path: Path) -> Tau2CameraConfig:
-    """Parameters with which the images were read; the defaults where they are unknown."""
-    with naming(path):
-        return from_mapping(Tau2CameraConfig, _parameters_of('tau2_camera', path) if path.exists() else {})
-
-
-def _parameters_of(node: str, path: Path) -> dict[str, Any]:
-    """Parameters of a node in a run's file; empty without a section of it."""
-    document = load_plain(path)
-    section = document.get(f'/{node}') if isinstance(document, dict) else None
-    values = section.get('ros__parameters') if isinstance(section, dict) else None
-    return values if isinstance(values, dict) else {}
+        raise InputError('no camera_time_offset of pose_ekf in it') from None
 
 
 def read_summary(path: Path) -> dict[str, Any]:
