@@ -192,7 +192,7 @@ class Decoder:
 
     def match(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
         """Correlation (Q,) of quadrilaterals (Q, 4, 2) with the upright patterns of ``ids`` (Q,)."""
-        values = self._contrasts(sampled(image, seen_between(quads, self._samples)))
+        values = self._values(image, quads)
         spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), np.float32(TINY))
         return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread, dtype=np.float64)
 
@@ -202,7 +202,7 @@ class Decoder:
         Over squares with a border and anything else inside: a share below r of their variance is left by the pattern
         with a probability of the order of r^(v/2), where v is the number of bits.
         """
-        values = self._contrasts(sampled(image, seen_between(quads, self._samples))).astype(np.float64)
+        values = self._values(image, quads).astype(np.float64)
         size = (values * values).sum(axis=1)
         by_marker, by_border = (values * self._patterns[4 * ids]).sum(axis=1), values @ self._border
         left, of_bits = size - by_marker**2, size - by_border**2
@@ -243,6 +243,10 @@ class Decoder:
             counts = without_tails(counts, sampled(image, seen_between(lag_tails, self._beside_sides)))
         means = counts.reshape(len(quads), 2, 4, -1).mean(axis=-1)
         return np.asarray(means[:, 0] - means[:, 1], dtype=np.float64)
+
+    def _values(self, image: Float32Array, quads: FloatArray) -> Float32Array:
+        """Mean counts (Q, m * m) of the cells of quadrilaterals (Q, 4, 2), without the background."""
+        return self._contrasts(sampled(image, seen_between(quads, self._samples)))
 
     def _contrasts(self, counts: Float32Array) -> Float32Array:
         """Mean counts (Q, m * m) of the cells without the background, by those of their samples (Q, P)."""

@@ -11,10 +11,12 @@ from support.scenes import motion_prior
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.detection.finding.drifted import drifted_markers
-from thermal_fiducial.core.detection.finding.template_matching import MarkerTemplate, NOT_THERE
+from thermal_fiducial.core.detection.finding.quads import halved
+from thermal_fiducial.core.detection.finding.template_matching import halvings, MarkerTemplate, NOT_THERE
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import sides_px
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.scenario import named, with_contrast
@@ -60,7 +62,10 @@ def drawn(markers, noise=0.0, shape=(240, 320), sign=1.0, seed=0):
 
 
 def template_of(image, marker_id, corners, reach, kinds=BOTH):
-    return MarkerTemplate([image], marker_id, corners, np.full(2, reach), kinds, DECODER)
+    images = [image]
+    for _ in range(halvings(sides_px(corners[None])[0] / DECODER.cells)):
+        images.append(halved(images[-1]))
+    return MarkerTemplate(images, marker_id, corners, np.full(2, reach), kinds, DECODER)
 
 
 @pytest.mark.parametrize('sign', BOTH)

@@ -13,15 +13,16 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.finding.template_matching import MarkerTemplate
-from thermal_fiducial.core.detection.patterns import Decoder
+from thermal_fiducial.core.detection.finding.quads import halved
+from thermal_fiducial.core.detection.finding.template_matching import halvings, MarkerTemplate
+from thermal_fiducial.core.detection.patterns import Decoder, NEAR_CELLS
 from thermal_fiducial.core.geometry.reprojection import sides_px
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # Standard deviations of a prediction within which a marker is looked for.
 _SIGMAS = 3.0
-# Standard deviation of a match along an axis; distance up to which markers are found at their predictions [cells].
-_OF_MATCH, _NEAR = 0.3, 0.5
+# Standard deviation of a match along an axis [cells].
+_OF_MATCH = 0.3
 # Bound on the number of false finds in a search, were all of the image squares with a border around random bits.
 _FALSE_FINDS = 0.001
 
@@ -51,10 +52,13 @@ def drifted_markers(
     -------
     (N,), and (N, 4, 2) corners, accurate to half a cell
     """
-    cells, images = sides_px(corners) / decoder.cells, [image]
+    cells = sides_px(corners) / decoder.cells
     reach = np.minimum(_SIGMAS * _stds_px(flow, of_camera), farthest_px)
-    if (reach < _NEAR * cells[:, None]).all():
+    if (reach < NEAR_CELLS.max() * cells[:, None]).all():
         return np.zeros(len(ids), dtype=np.bool_), corners
+    images = [image]
+    for _ in range(halvings(cells.max())):
+        images.append(halved(images[-1]))
     views = zip(ids.tolist(), corners, reach, strict=True)
     templates = [MarkerTemplate(images, *view, kinds, decoder) for view in views]
     alone = [template.best(np.zeros(2), near) for template, near in zip(templates, reach, strict=True)]

@@ -3,13 +3,14 @@
 Source: J. Lewis, "Fast Normalized Cross-Correlation", 1995.
 """
 
+from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.finding.quads import halfway, halved
+from thermal_fiducial.core.detection.finding.quads import halfway
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.geometry.reprojection import sides_px
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, TINY
@@ -46,12 +47,17 @@ class Match(NamedTuple):
 NOT_THERE = Match(np.zeros(2), -math.inf, 1.0)
 
 
+def halvings(cell_px: float) -> int:
+    """How many times the resolution is halved at which a marker with cells of this width is looked for."""
+    return max(math.ceil(math.log2(cell_px / _CELL_PX)), 0)
+
+
 class MarkerTemplate:
     """A marker as predicted, and how similar its pattern is to the image around the predicted place.
 
     Parameters
     ----------
-    images : the image, and as many of half the resolution of the one before as were needed so far; more are appended
+    images : the image, and those of half the resolution of the one before, as many as :func:`halvings` says
     marker_id, corners : its ID, and (4, 2) as predicted [px]
     reach_px : (2,) how far it is looked for along columns and rows [px]
     kinds : polarities, 1 for markers darker than their surroundings, -1 for brighter
@@ -59,7 +65,7 @@ class MarkerTemplate:
 
     def __init__(
         self,
-        images: list[Float32Array],
+        images: Sequence[Float32Array],
         marker_id: int,
         corners: FloatArray,
         reach_px: FloatArray,
@@ -67,11 +73,9 @@ class MarkerTemplate:
         decoder: Decoder,
     ) -> None:
         cell = float(sides_px(corners[None])[0]) / decoder.cells
-        halvings = max(math.ceil(math.log2(cell / _CELL_PX)), 0)
-        while len(images) <= halvings:
-            images.append(halved(images[-1]))
-        self._pixel, self._image = 2.0**halvings, images[halvings]
-        for _ in range(halvings):
+        number = halvings(cell)
+        self._pixel, self._image = 2.0**number, images[number]
+        for _ in range(number):
             corners = halfway(corners)
         self._id, self._corners, self._decoder = np.array([marker_id]), corners, decoder
         self._square_px = (cell / self._pixel * decoder.cells) ** 2
