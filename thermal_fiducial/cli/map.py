@@ -15,8 +15,8 @@ from thermal_fiducial.cli.ranges import COORDINATE_M, MARKER_ID, QUATERNION, SIG
 from thermal_fiducial.cli.subcommands import file_to_write, require_unit
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
-from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.core.wording import number_of

@@ -1,7 +1,7 @@
 """Ranges of numbers on the command line. None holds NaN, infinity, or what no plate, board, camera or room has."""
 
 from thermal_fiducial.cli.subcommands import number, whole_number
-from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
+from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 
 #: Length of a sheet or between cuts: the widest sheets of acrylic are 2 to 3 m.
 LENGTH_MM = number(0.0, 10_000.0, 'mm')

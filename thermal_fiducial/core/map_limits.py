@@ -4,10 +4,10 @@ import numpy as np
 
 from thermal_fiducial.core.types import FloatArray
 
+#: Farthest coordinate of anything in a map [m]; single precision still resolves a centimetre there.
+LARGEST_COORDINATE = 1e5
 #: Largest side of a marker [m].
 LARGEST_MARKER_M = 100.0
-#: Largest element of a covariance: the square of the farthest coordinate [m^2, m rad, rad^2].
-_LARGEST_ELEMENT = 1e10
 #: Tolerance of a covariance's symmetry and eigenvalues, relative to its largest element: rounding to so many.
 _SIX_DIGITS = 1e-6
 
@@ -18,7 +18,7 @@ def fault_of_covariance(values: FloatArray) -> str:
     Less is asked than of a measurement: an error may be zero, and maps are written by other hands.
     """
     scale = float(np.abs(values).max())
-    if not scale < _LARGEST_ELEMENT:
+    if not scale < LARGEST_COORDINATE**2:
         return 'not finite, or too large'
     if np.abs(values - values.T).max() > _SIX_DIGITS * scale:
         return 'not symmetric'

@@ -14,7 +14,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from thermal_fiducial.core.map_limits import fault_of_covariance, LARGEST_MARKER_M
+from thermal_fiducial.core.map_limits import fault_of_covariance, LARGEST_COORDINATE, LARGEST_MARKER_M
 from thermal_fiducial.core.types import LARGEST_ID
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.schema import load_yaml, parse_yaml, Value
@@ -28,7 +28,6 @@ VERSION = 1
 # rounding must leave them positive definite: markers far from the anchor share nearly all of their errors.
 _DIGITS = 9
 _MOST = 2**63 - 1
-_LARGEST_M = 1e5
 _SIMPLE = re.compile(r'[A-Za-z][A-Za-z0-9_./-]*')
 _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
 
@@ -152,10 +151,12 @@ def _entry(value: Value) -> MarkerEntry:
         id=marker_id,
         size=_optional(fields, 'size', _size, None),
         fixed=_optional(fields, 'fixed', Value.flag, False),
-        position=tuple(fields['position'].numbers(3, _LARGEST_M)),
+        position=tuple(fields['position'].numbers(3, LARGEST_COORDINATE)),
         orientation=tuple(fields['orientation'].unit_quaternion()),
         covariance=_optional(fields, 'covariance', _covariance, ()),
-        reprojection_error_px=_optional(fields, 'reprojection_error_px', lambda v: v.number(0.0, _LARGEST_M), 0.0),
+        reprojection_error_px=_optional(
+            fields, 'reprojection_error_px', lambda v: v.number(0.0, LARGEST_COORDINATE), 0.0
+        ),
         observations=_optional(fields, 'observations', _count, 0),
         first_seen_ns=_optional(fields, 'first_seen_ns', _count, 0),
         last_seen_ns=_optional(fields, 'last_seen_ns', _count, 0),
@@ -184,7 +185,7 @@ def _size(value: Value) -> float:
 
 
 def _covariance(value: Value) -> tuple[float, ...]:
-    numbers = value.numbers(36, _LARGEST_M**2)
+    numbers = value.numbers(36, LARGEST_COORDINATE**2)
     if fault := fault_of_covariance(np.reshape(numbers, (6, 6))):
         raise value.error(fault)
     return tuple(numbers)

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE
+from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
+from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError

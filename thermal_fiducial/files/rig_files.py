@@ -8,9 +8,9 @@ import numpy as np
 
 from thermal_fiducial.config import ImuNoise, parameters
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.plausibility import is_rigid, LARGEST_COORDINATE, require_usable
+from thermal_fiducial.core.geometry.plausibility import is_rigid, require_usable
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
-from thermal_fiducial.core.map_limits import LARGEST_MARKER_M
+from thermal_fiducial.core.map_limits import LARGEST_COORDINATE, LARGEST_MARKER_M
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import MODEL_SYNONYMS

@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermal_fiducial.core.map_limits import LARGEST_MARKER_M
+from thermal_fiducial.core.map_limits import LARGEST_COORDINATE, LARGEST_MARKER_M
 from thermal_fiducial.core.types import Counts, FloatArray, Gray
 from thermal_fiducial.errors import InputError
 
 if TYPE_CHECKING:
     from thermal_fiducial.core.geometry.camera import Camera
 
-#: Farthest coordinate of anything in a map [m]; single precision still resolves a centimetre there.
-LARGEST_COORDINATE = 1e5
 #: Variances [m^2, rad^2, px^2]: from a tenth of a nanometre to ten kilometres, which others write for "unknown".
 SMALLEST_VARIANCE, LARGEST_VARIANCE = 1e-20, 1e8
 #: Least share of a variance that the other components may leave unexplained; rounding takes less than a tenth of it.

@@ -12,7 +12,8 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE, LARGEST_VARIANCE
+from thermal_fiducial.core.geometry.plausibility import LARGEST_VARIANCE
+from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 from thermal_fiducial.core.measurements import (
     columns,
     CORNER_COVARIANCE_FIELDS,
