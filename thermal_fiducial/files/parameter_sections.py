@@ -33,6 +33,28 @@ def mistyped_sections(sections: Mapping[str, Mapping[str, Any]]) -> Iterator[tup
             yield node, f'section {shown(section)}: no node of ours is called so; did you mean {node}?'
 
 
+def sections_outside(sections: Mapping[str, Mapping[str, Any]], node: str) -> Iterator[str]:
+    """A warning for each section without a namespace that is meant for ``node``, which has one: ROS ignores it.
+
+    In a file with sections for that namespace, those without one are taken to be for nodes without one.
+
+    Parameters
+    ----------
+    sections : name to parameters
+    node : its full name, as ``/drone/pose_ekf``
+    """
+    namespace, _, name = node.rpartition('/')
+    spaces = {section.strip('/').rpartition('/')[0] for section in sections}
+    if not namespace or namespace.strip('/') in spaces:
+        return
+    for section in sections:
+        if section.strip('/') == name:
+            yield (
+                f'section {shown(section)}: ROS ignores it, as it is for a node without a namespace; '
+                f'for {node} write {node} or /**/{name}'
+            )
+
+
 def _sections(path: Path, document: Mapping[str, Any], namespace: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Sections of a namespace, which may be nested as ROS has it: ``drone: {pose_ekf: {ros__parameters: {...}}}``."""
     for name, content in document.items():

@@ -111,9 +111,9 @@ def test_nodes_of_others_may_have_names_like_ours(tmp_path, section, values):
 def test_the_node_whose_section_is_mistyped_warns_of_it(tmp_path):
     file = tmp_path / 'rig.yaml'
     file.write_text(yaml.safe_dump({'pose_efk': {'ros__parameters': {'gate': 30.0}}}))
-    (line,) = params.mistyped_for('pose_ekf', ['node', '--ros-args', '--params-file', str(file), '-r', 'a:=b'])
+    (line,) = params.ignored_for('/pose_ekf', ['node', '--ros-args', '--params-file', str(file), '-r', 'a:=b'])
     assert line == f'{file}: section pose_efk: no node of ours is called so; did you mean pose_ekf?'
-    assert not [*params.mistyped_for('tau2_camera', ['--ros-args', '--params-file', str(file)])]
+    assert not [*params.ignored_for('/tau2_camera', ['--ros-args', '--params-file', str(file)])]
     program = """
 import os, signal, sys
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
@@ -160,3 +160,51 @@ def test_a_map_of_another_dictionary_is_warned_of(tmp_path):
     map_file.write_text(map_file.read_text().replace('DICT_4X4_50', 'DICT_5X5_50'))
     (warning,) = read_settings(FILE, {'map_file': str(map_file)}).warnings
     assert 'DICT_5X5_50' in warning
+
+
+@pytest.mark.parametrize(
+    ('section', 'others', 'ignored'),
+    [
+        ('pose_ekf', {}, True),
+        ('/pose_ekf', {'/drone/down/**': {'gate': 20.0}}, True),
+        ('/**/pose_ekf', {}, False),
+        ('drone/pose_ekf', {}, False),
+        ('pose_ekf', {'/drone/**': {'gate': 20.0}}, False),
+        ('pose_ekf', {'/**': {'second_camera': 'drone'}}, False),
+    ],
+)
+def test_a_section_without_the_namespace_of_its_node_is_warned_of(tmp_path, section, others, ignored):
+    """Nothing was said, and the robot flew with the defaults."""
+    file = tmp_path / 'rig.yaml'
+    sections = {section: {'gate': 30.0}, **others}
+    file.write_text(yaml.safe_dump({name: {'ros__parameters': values} for name, values in sections.items()}))
+    why = 'ROS ignores it, as it is for a node without a namespace'
+    line = f'{file}: section {section}: {why}; for /drone/pose_ekf write /drone/pose_ekf or /**/pose_ekf'
+    given = ['node', '--ros-args', '--params-file', str(file)]
+    assert [*params.ignored_for('/drone/pose_ekf', given)] == [line] * ignored
+    assert not [*params.ignored_for('/pose_ekf', given)]
+    assert not [*params.ignored_for('/drone/tau2_camera', given)]
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('section', ['pose_ekf', '/**/pose_ekf', 'drone/pose_ekf'])
+def test_ros_ignores_what_is_warned_of(tmp_path, section):
+    file = tmp_path / 'rig.yaml'
+    file.write_text(yaml.safe_dump({section: {'ros__parameters': {'gate': 30.0}}}))
+    arguments = ['--ros-args', '--params-file', str(file), '-r', '__ns:=/drone']
+    program = """
+import os, signal, sys
+from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
+from thermal_fiducial.ros.process import run
+
+class Stopped(PoseEkfNode):
+    def diagnose(self, stamp_ns):
+        print(self.config.gate, len(self.remarks), flush=True)
+        os.kill(os.getpid(), signal.SIGINT)
+
+sys.exit(run.run(Stopped))
+"""
+    done = finished(program, *arguments)
+    gate, remarks = done.stdout.split()
+    assert done.returncode == 0
+    assert (float(gate) == 30.0, int(remarks)) == ((False, 1) if section == 'pose_ekf' else (True, 0))

@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 
 from thermal_fiducial.config import check_names, Config, for_whole_numbers, from_mapping, parameters, QOS_OVERRIDES
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
-from thermal_fiducial.files.parameter_sections import load_sections, mistyped_sections
+from thermal_fiducial.files.parameter_sections import load_sections, mistyped_sections, sections_outside
 
 _ARRAYS = {
     float: Parameter.Type.DOUBLE_ARRAY,
@@ -52,17 +52,29 @@ def declare(node: Node, kind: type[Config]) -> Config:
     return from_mapping(kind, current_values(node, kind))
 
 
-def mistyped_for(node: str, args: Sequence[str]) -> Iterator[str]:
-    """A warning for each section of the parameter files in ``args`` whose mistyped name is meant for ``node``.
+def ignored_for(node: str, args: Sequence[str]) -> Iterator[str]:
+    """A warning for each section of the parameter files in ``args`` that is meant for ``node``, but ignored by ROS.
 
-    A node that was given another name has none: only who gave it knows how it is spelt.
+    A node that was given another name has none: only who gave it knows how it is spelt. Nor has one of a second camera
+    for sections without a namespace, which are for the first.
+
+    Parameters
+    ----------
+    node : its full name, as ``/drone/pose_ekf``
+    args : arguments of the process
     """
+    namespace, _, name = node.rpartition('/')
+    files: dict[str, dict[str, dict[str, Any]]] = {}
     for file in (value for flag, value in pairwise(args) if flag == '--params-file'):
         # ROS has read the file; what we would refuse in it is not refused here.
         with suppress(InputError):
-            for meant, line in mistyped_sections(load_sections(Path(file))):
-                if meant == node:
-                    yield f'{file}: {line}'
+            files[file] = load_sections(Path(file))
+    seconds = {values.get('second_camera') for sections in files.values() for values in sections.values()}
+    is_second = namespace.rpartition('/')[2] in seconds
+    for file, sections in files.items():
+        mistyped = (line for meant, line in mistyped_sections(sections) if meant == name)
+        outside = () if is_second else sections_outside(sections, node)
+        yield from (f'{file}: {line}' for line in (*mistyped, *outside))
 
 
 def follow(node: Node, kind: type[Config], apply: Callable[[Config], None]) -> None:
