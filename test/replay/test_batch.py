@@ -1,5 +1,6 @@
 """Many bags on workers of Dask: the same bytes from any number of them, also when one is killed."""
 
+from dataclasses import replace
 import errno
 import os
 from pathlib import Path
@@ -18,7 +19,8 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import work_folders
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
-from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary
+from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.replay import many_bags
 from thermal_fiducial.replay.workers import workers
 
@@ -78,6 +80,16 @@ def test_the_joint_map_starts_with_the_sides_of_the_parameters(tmp_path):
     parameters.write_text(f'/**: {{ros__parameters: {{{side}}}}}')
     assert batch(tmp_path, 'out', bags=['flight0']) == 0
     assert load_map(tmp_path / 'out' / 'marker_map.yaml').markers[0].size == small_bag.SIZE
+
+
+def test_the_joint_map_has_the_dictionary_file_beside_it(tmp_path):
+    small_bag.recording(seconds=0.5).write(tmp_path / 'flight0')
+    marker_map, _ = small_bag.side_files(tmp_path)
+    save_dictionary(tmp_path / 'own.yaml', 'own', load_dictionary('DICT_4X4_50'))
+    save_map(marker_map, replace(load_map(marker_map), dictionary='own.yaml'))
+    assert batch(tmp_path, 'out', bags=['flight0']) == 0
+    assert load_map(tmp_path / 'out' / 'marker_map.yaml').dictionary == 'own.yaml'
+    assert (tmp_path / 'out' / 'own.yaml').read_bytes() == (tmp_path / 'own.yaml').read_bytes()
 
 
 def test_markers_of_a_bag_that_the_mapper_refused_are_not_in_the_joint_map_either(folder, alone):

@@ -24,7 +24,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import map_history
 from thermal_fiducial.files.atomic import locked
 from thermal_fiducial.files.csv_rows import csv_rows
-from thermal_fiducial.files.dictionary import not_in_dictionary
+from thermal_fiducial.files.dictionary import bring_from_map, not_in_dictionary
 from thermal_fiducial.files.map_format import read_document, upgraded
 from thermal_fiducial.files.marker_map import dump_map, load_map
 from thermal_fiducial.files.packages import require_plots
@@ -233,6 +233,7 @@ def _merge(args: argparse.Namespace) -> int:
         note = '  left out: it disagrees with the others' if key in alignment.outliers else ''
         print(f'marker {key}: {1e3 * residual:.1f} mm{note}')
     if args.out:
+        bring_from_map(merged.dictionary, args.map.parent, args.out.parent)
         map_history.save_with_history(args.out, merged, f'merge {args.map.name} and {args.other.name}')
         print(f'{args.out}: {merged.size_in_words}')
         return 0

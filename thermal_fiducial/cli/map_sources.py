@@ -32,6 +32,7 @@ from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.dictionary import (
     bring_beside,
+    bring_from_map,
     dictionary_of_map,
     not_in_dictionary,
     other_patterns,
@@ -133,6 +134,7 @@ def _refine(args: argparse.Namespace) -> int:
     start = load_map(args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
     args.marker_size = args.marker_size or _only_size(start)
     _warn_of_other_dictionary(args, start)
+    bring_from_map(start.dictionary, args.map.parent, work.path.parent)
     frames = _read_detections(file, start, args, camera)
     if len(frames) > args.max_frames:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, args.max_frames).astype(int)]

@@ -144,6 +144,21 @@ def bring_beside(name: str, folder: Path) -> None:
     write_text(copy, text)
 
 
+def bring_from_map(name: str, map_folder: Path, folder: Path) -> None:
+    """Copy the dictionary file of a map in ``map_folder`` into the ``folder`` of one that is made from it.
+
+    Nothing for a known name, or if the map has no such file beside it: it may be on the robot alone.
+
+    Raises
+    ------
+    InputError
+        As :func:`bring_beside`.
+    """
+    own = map_folder / name
+    if is_own_file(name) and name == own.name and is_there(own):
+        bring_beside(str(own), folder)
+
+
 def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: Dictionary, comment: str = '') -> None:
     """Write ``dictionary`` as a dictionary file below a ``comment``. Raises InputError if it cannot be written."""
     document = {

@@ -20,6 +20,7 @@ from thermal_fiducial.core.measurements import Markers
 from thermal_fiducial.errors import InputError, RunError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.dictionary import bring_from_map
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.work_folders import named_as_those_of, remove_left_behind, work_folder
 from thermal_fiducial.files.writing import into, write_text
@@ -155,6 +156,7 @@ def run_batch(
     save_map(batch.out / MAP_FILE, built.map)
     summary = _summary_of(built) | {'runs': [run.run.name for run in runs], 'frames': frames}
     write_text(batch.out / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
+    bring_from_map(built.map.dictionary, batch.options.map_file.parent, batch.out)
     return summary
 
 

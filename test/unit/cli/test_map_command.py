@@ -20,6 +20,7 @@ from thermal_fiducial.core.geometry.se3 import apply, inverse, so3_exp, transfor
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.files.camera_info import save_camera
+from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.map_tools.map_building import build_map
 from thermal_fiducial.map_tools.map_doubts import doubts
@@ -382,6 +383,36 @@ def photographed(path, poses):
     file.write_text(detections(poses))
     save_camera(path.with_name('camera.yaml'), CAMERA)
     return [file, '--calibration', path.with_name('camera.yaml')]
+
+
+@pytest.mark.parametrize('action', ['refine', 'merge'])
+def test_a_map_that_is_written_elsewhere_has_its_dictionary_file_beside_it(path, poses, photographed, capsys, action):
+    """The file stayed behind, and with it whether the markers are in the dictionary was unknown."""
+    own, out = path.with_name('own.yaml'), path.parent / 'maps' / 'hall.yaml'
+    out.parent.mkdir()
+    save_dictionary(own, 'own', load_dictionary('DICT_4X4_50'))
+    save_map(path, replace(load_map(path), dictionary=own.name))
+    other = path.with_name('other.yaml')
+    save_map(other, load_map(path))
+    sources = photographed if action == 'refine' else [other]
+    assert run('--marker-size', SIZE, action, path, *sources, '--out', out) == 0
+    capsys.readouterr()
+    assert run('check', out) == 0
+    assert capsys.readouterr().out == f'{out}: sound\n'
+    (out.parent / own.name).write_text('other: things')
+    assert run('--marker-size', SIZE, action, path, *sources, '--out', out) == 2
+    assert f'{out.parent / own.name}: not the dictionary {own}, which a map' in capsys.readouterr().err
+    assert (out.parent / own.name).read_text() == 'other: things'
+
+
+@pytest.mark.parametrize('dictionary', ['own.yaml', '../own.yaml'])
+def test_a_map_whose_dictionary_file_is_on_the_robot_is_refined_without_it(path, photographed, dictionary):
+    out = path.parent / 'maps' / 'hall.yaml'
+    out.parent.mkdir()
+    save_map(path, replace(load_map(path), dictionary=dictionary))
+    assert run('--marker-size', SIZE, 'refine', path, *photographed, '--out', out) == 0
+    assert load_map(out).dictionary == dictionary
+    assert not (out.parent / 'own.yaml').exists()
 
 
 def test_refine_takes_the_calibration_of_the_run(path, poses, photographed, capsys):
