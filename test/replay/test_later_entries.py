@@ -9,6 +9,7 @@ from thermal_fiducial.cli.main import main
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMU_TOPIC, MAP_ERROR_TOPIC
 from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary
+from thermal_fiducial.files.marker_map import load_map
 
 pytestmark = pytest.mark.ros
 
@@ -125,3 +126,19 @@ def test_a_map_with_a_dictionary_of_its_own_is_read_in_the_run_folder(folder, ca
     assert 'dictionary' not in capfd.readouterr().err
     assert main(['map', 'check', str(run / 'marker_map.yaml')]) == 0
     assert 'own.yaml' not in capfd.readouterr().err
+
+
+def test_the_map_of_a_run_without_one_names_a_dictionary_file_that_is_beside_it(folder, tmp_path, capfd):
+    """It had the path of the file, which the rules of maps refuse, and which a folder that is moved leaves behind."""
+    own, run, moved = tmp_path / 'own.yaml', tmp_path / 'run', tmp_path / 'moved'
+    save_dictionary(own, 'own', load_dictionary('DICT_4X4_50'))
+    params = tmp_path / 'params.yaml'
+    params.write_text(f'/**: {{ros__parameters: {{dictionary: {own}}}}}')
+    words = ['replay', folder / 'markers', '--out', run, '--params', params, '--no-report']
+    # No pose goes out.
+    assert main([*map(str, words)]) == 1
+    run.rename(moved)
+    assert load_map(moved / 'marker_map.yaml').dictionary == own.name
+    capfd.readouterr()
+    main(['map', 'check', str(moved / 'marker_map.yaml')])
+    assert 'dictionary' not in capfd.readouterr().out

@@ -236,8 +236,13 @@ def _copy_map(given: Path, run_map: Path, dictionary: str) -> None:
     with into(run_map):
         shutil.copyfile(given, run_map)
     own = given.parent / dictionary
-    copy = copied_beside(str(own), run_map.parent)
-    if copy is not None and dictionary == own.name and own.is_file():
+    if dictionary == own.name:
+        _copy_dictionary(own, run_map.parent)
+
+
+def _copy_dictionary(own: Path, folder: Path) -> None:
+    copy = copied_beside(str(own), folder)
+    if copy is not None and own.is_file():
         with into(copy):
             shutil.copyfile(own, copy)
 
@@ -245,7 +250,8 @@ def _copy_map(given: Path, run_map: Path, dictionary: str) -> None:
 def _final_map(path: Path, config: MarkerMapperConfig) -> MarkerMap:
     """The final map; writes its file if no node has saved it, and completes marker sizes that the file leaves out."""
     if not path.exists():
-        marker_map = MarkerMap(frame_id=config.map_frame, dictionary=config.dictionary)
+        marker_map = MarkerMap(frame_id=config.map_frame, dictionary=Path(config.dictionary).name)
+        _copy_dictionary(Path(config.dictionary), path.parent)
     else:
         marker_map = load_map(path, config.marker_size, size_overrides(config.marker_size_overrides))
         if config.mode == 'mapping':

@@ -13,6 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from thermal_fiducial.core.mapping.map_data import MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.files.atomic import locked
+from thermal_fiducial.files.dictionary import load_dictionary, not_in_dictionary, save_dictionary
 from thermal_fiducial.files.map_history import autosave_file, entries
 from thermal_fiducial.files.map_keeper import MapKeeper
 from thermal_fiducial.files.marker_map import load_map, save_map
@@ -73,6 +74,26 @@ def test_load_undo_and_save_of_a_free_map(graph, map_file, mode):
     assert ask(graph, 'undo')[0]
     assert ask(graph, 'undo') == (False, f'{map_file}: no earlier version is kept')
     assert ask(graph, 'reset') == (True, '2 markers left')
+
+
+def test_a_map_that_begins_empty_names_a_dictionary_file_that_is_beside_it(graph, tmp_path):
+    """It had the path of the file, which the rules of maps refuse, and which a folder that is moved leaves behind."""
+    own, file = tmp_path / 'rig' / 'own.yaml', tmp_path / 'maps' / 'hall.yaml'
+    own.parent.mkdir()
+    file.parent.mkdir()
+    save_dictionary(own, 'own', load_dictionary('DICT_4X4_50'))
+    graph.add(MarkerMapperNode, map_file=str(file), dictionary=str(own))
+    assert ask(graph, 'save') == (True, f'0 markers saved to {file}')
+    moved = file.parent.rename(tmp_path / 'moved')
+    named = load_map(moved / file.name).dictionary
+    assert named == own.name
+    assert not_in_dictionary([3, 50], named, moved) == [50]
+    # A map is saved where its dictionary is on another computer.
+    own.unlink()
+    file.parent.mkdir()
+    saved, message = ask(graph, 'save')
+    assert (saved, load_map(file).dictionary) == (True, own.name)
+    assert message.startswith(f'0 markers saved to {file}, without its dictionary: {own}: cannot read it: ')
 
 
 class Flown(MarkerMapperNode):

@@ -14,7 +14,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.dictionary import other_patterns
+from thermal_fiducial.files.dictionary import bring_beside, other_patterns
 from thermal_fiducial.files.map_keeper import MapKeeper
 from thermal_fiducial.files.marker_map import other_frame
 from thermal_fiducial.files.reading import is_there
@@ -65,7 +65,7 @@ class MapServices:
 
     def _first_map(self) -> MarkerMap:
         node, config = self._node, self._node.config
-        empty = MarkerMap(frame_id=config.map_frame, dictionary=config.dictionary)
+        empty = MarkerMap(frame_id=config.map_frame, dictionary=Path(config.dictionary).name)
         if not config.map_file:
             return empty
         before = len(node.faults)
@@ -150,7 +150,19 @@ class MapServices:
     def _save(self, marker_map: MarkerMap) -> str:
         path = self._keeper.save(marker_map)
         why = f', as {self._keeper.obstacle}' if self._keeper.obstacle else ''
-        return f'{marker_map.size_in_words} saved to {path}{why}'
+        return f'{marker_map.size_in_words} saved to {path}{why}{self._without_dictionary(marker_map, path.parent)}'
+
+    def _without_dictionary(self, marker_map: MarkerMap, folder: Path) -> str:
+        """Copy the dictionary file that a saved map names beside it, if it is not there; why it could not be."""
+        own = self._node.config.dictionary
+        if marker_map.dictionary != Path(own).name or is_there(folder / marker_map.dictionary):
+            return ''
+        try:
+            bring_beside(own, folder)
+        except InputError as error:
+            # The map is saved: nodes read the dictionary from their own parameter.
+            return f', without its dictionary: {error}'
+        return ''
 
     def load(self) -> str:
         """Reload the map file, for example after edits with ``thermal-fiducial map``."""
