@@ -194,7 +194,9 @@ def test_a_full_disk_at_undo_costs_neither_the_map_nor_its_history_nor_the_node(
 
 
 @pytest.mark.parametrize('mode', MODES)
-def test_a_free_mapper_refines_in_a_process_of_its_own_in_either_mode(graph, map_file, mode):
+def test_a_free_mapper_refines_in_a_process_of_its_own_in_either_mode(graph, map_file, tmp_path, monkeypatch, mode):
+    # The next mapper would begin free as this one is set here.
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
     before = set(multiprocessing.active_children())
     node = graph.add(MarkerMapperNode, live=True, map_file=str(map_file), mode=mode)
     try:

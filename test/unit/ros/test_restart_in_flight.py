@@ -13,9 +13,11 @@ from support.ros_graph import ros_graph
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.clock_offset import recent_clock_offset, save_clock_offset
+from thermal_fiducial.files.restart_file import save_for_restart
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.ros.filter_node import filter_memory
+from thermal_fiducial.ros.mapper_node import freeze_memory
 
 
 def test_the_file_holds_it_for_ten_seconds(tmp_path):
@@ -130,10 +132,8 @@ def test_a_restarted_mapper_is_frozen_or_free_as_the_one_before(tmp_path, map_fi
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     start = {'live': True, 'map_file': str(map_file), 'mode': mode}
     with ros_graph() as graph:
-        node = graph.add(MarkerMapperNode, **start)
+        graph.add(MarkerMapperNode, **start)
         freeze(graph, frozen)
-        node.diagnose(0)
-        graph.spin_until(lambda: list(tmp_path.rglob('marker_mapper*.json')))
     # It was killed.
     said = f'started again in flight: the map is {"frozen" if frozen else "free"} as before'
     assert said not in capfd.readouterr().err
@@ -151,6 +151,54 @@ def test_a_restarted_mapper_is_frozen_or_free_as_the_one_before(tmp_path, map_fi
     with ros_graph() as graph:
         assert graph.add(MarkerMapperNode, **start).mapper.frozen == (mode == 'localization')
     assert said not in capfd.readouterr().err
+
+
+def frozen_in_file(folder):
+    (file,) = folder.rglob('marker_mapper*.json')
+    return json.loads(file.read_text())['frozen']
+
+
+@pytest.mark.ros
+def test_what_freeze_is_asked_is_kept_at_once(tmp_path, monkeypatch):
+    """It was written once a second: a map that was frozen just before a crash changed again after it."""
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    with ros_graph() as graph:
+        graph.add(MarkerMapperNode, live=True)
+        for frozen in (True, False, True):
+            freeze(graph, frozen)
+            assert frozen_in_file(tmp_path) == frozen
+
+
+@pytest.mark.ros
+def test_a_slow_disk_holds_no_answer_of_freeze_and_keeps_the_last(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    idle = threading.Event()
+
+    def save(*arguments):
+        assert idle.wait(60.0)
+        save_for_restart(*arguments)
+
+    monkeypatch.setattr(freeze_memory, 'save_for_restart', save)
+    with ros_graph() as graph:
+        node = graph.add(MarkerMapperNode, live=True)
+        for frozen in (True, False):
+            assert freeze(graph, frozen) == ('map frozen' if frozen else 'map free')
+        assert not list(tmp_path.rglob('*.json'))
+        idle.set()
+        graph.spin_until(lambda: list(tmp_path.rglob('*.json')) and frozen_in_file(tmp_path) is False)
+        node.finish()
+
+
+@pytest.mark.ros
+def test_where_no_file_can_be_written_the_map_is_frozen_all_the_same(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    (tmp_path / 'thermal_fiducial').touch()
+    with ros_graph() as graph:
+        node = graph.add(MarkerMapperNode, live=True)
+        for frozen in (True, False, True):
+            assert freeze(graph, frozen) == ('map frozen' if frozen else 'map free')
+            assert node.mapper.frozen == frozen
+        assert (node.refused, 'thermal_fiducial' in node.last_refusal) == (1, True)
 
 
 @pytest.mark.ros
@@ -171,10 +219,8 @@ def test_a_mapper_that_nobody_has_frozen_leaves_no_file(tmp_path, monkeypatch):
 def test_what_is_no_file_of_a_mapper_freezes_nothing(tmp_path, monkeypatch, text):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     with ros_graph() as graph:
-        node = graph.add(MarkerMapperNode, live=True)
+        graph.add(MarkerMapperNode, live=True)
         freeze(graph, True)
-        node.diagnose(0)
-        graph.spin_until(lambda: list(tmp_path.rglob('marker_mapper*.json')))
         (file,) = tmp_path.rglob('marker_mapper*.json')
     file.write_text(text)
     with ros_graph() as graph:

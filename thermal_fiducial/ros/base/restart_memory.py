@@ -31,8 +31,13 @@ class RestartMemory:
         self._fault: InputError | None = None
         node.completions.append(self._forget)
 
-    def save(self, write: Callable[[Path], None]) -> None:
+    def save(self, write: Callable[[Path], None], patience_s: float = 0.0) -> None:
         """Call ``write`` with the path, in a thread, as a disk that is busy holds no pose; not while one still runs.
+
+        Parameters
+        ----------
+        write : replaces the file at a path
+        patience_s : longest time to wait for its end [s]
 
         Raises
         ------
@@ -45,6 +50,8 @@ class RestartMemory:
         if self.active and not self._writer.is_alive():
             self._writer = Thread(target=self._write, args=(write,), daemon=True)
             self._writer.start()
+        if patience_s and self._writer.is_alive():
+            self._writer.join(patience_s)
 
     def _write(self, write: Callable[[Path], None]) -> None:
         try:

@@ -1,6 +1,6 @@
-"""Restart after a crash in flight: whether ``~/freeze`` has frozen the map or set it free, saved once a second."""
+"""Restart after a crash in flight: whether ``~/freeze`` has frozen the map or set it free."""
 
-from functools import partial
+from pathlib import Path
 from typing import Any
 
 from thermal_fiducial.files.restart_file import recent_values, save_for_restart
@@ -8,6 +8,8 @@ from thermal_fiducial.ros.base.node import StageNode
 from thermal_fiducial.ros.base.restart_memory import RestartMemory
 
 _KIND, _FROZEN = 'freeze', 'frozen'
+#: Longest time for which the service waits for the disk [s], three frames: no frame is processed meanwhile.
+_PATIENCE_S = 0.1
 
 
 class FreezeMemory:
@@ -31,8 +33,19 @@ class FreezeMemory:
         self._logger.warning(f'started again in flight: the map is {"frozen" if self.asked else "free"} as before')
         return self.asked
 
+    def ask(self, frozen: bool) -> None:
+        """Take note of what the service is asked, and save it at once: a mapper that crashes next has it in its file.
+
+        Raises
+        ------
+        InputError
+            As :meth:`save`.
+        """
+        self.asked = frozen
+        self._memory.save(self._write, _PATIENCE_S)
+
     def save(self) -> None:
-        """Save it for a restart, once the service was called.
+        """Refresh what was saved, so that it stays recent, once the service was called.
 
         Raises
         ------
@@ -40,4 +53,11 @@ class FreezeMemory:
             The file could not be written; raised once.
         """
         if self.asked is not None:
-            self._memory.save(partial(save_for_restart, kind=_KIND, values={_FROZEN: self.asked}))
+            self._memory.save(self._write)
+
+    def _write(self, path: Path) -> None:
+        # Again if the service is called meanwhile: no other thread writes until this one has ended.
+        written = None
+        while written != self.asked:
+            written = self.asked
+            save_for_restart(path, _KIND, {_FROZEN: written})

@@ -94,7 +94,7 @@ class MapServices:
         return '; '.join(filter(None, (self._other_dictionary, self._keeper.fault)))
 
     def remember(self) -> None:
-        """Save what a mapper that starts again in flight begins with: whether the map is frozen.
+        """Refresh what a mapper that starts again in flight begins with: whether the map is frozen.
 
         Raises
         ------
@@ -199,8 +199,9 @@ class MapServices:
             raise InputError('the map is frozen')
 
     def _on_freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self.mapper.frozen = self._memory.asked = bool(request.data)
+        self.mapper.frozen = bool(request.data)
         self.refinement.prepare()
+        self._node.guard(self._memory.ask, self.mapper.frozen)
         response.success, response.message = True, 'map frozen' if request.data else 'map free'
         return response
 
