@@ -9,9 +9,9 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.camera_info import load_camera
-from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.parameter_sections import load_sections
 from thermal_fiducial.files.reading import is_there
-from thermal_fiducial.report.run_folder import bag_of_run, bag_options, read_summary
+from thermal_fiducial.report.run_folder import bag_of_run, bag_options, PARAMETERS, read_summary
 
 
 def camera_of_run(run: Path) -> Camera:
@@ -24,7 +24,8 @@ def camera_of_run(run: Path) -> Camera:
     Raises
     ------
     InputError
-        There is no such run, or neither; the message names the option for a calibration.
+        There is no such run, or neither; the message names the option for a calibration. Or a malformed file of
+        parameters, as for all that is read of a run here.
     """
     if not is_there(run):
         raise InputError(f'{run}: no such run')
@@ -62,11 +63,12 @@ def dictionary_of_run(run: Path) -> str:
 
 
 def _parameter(run: Path, node: str, name: str) -> Any:
-    """A parameter of a node in the replay; None if it is unknown."""
-    path = run / 'parameters.yaml'
-    if not path.is_file():
-        return None
-    try:
-        return load_plain(path)[f'/{node}']['ros__parameters'][name]
-    except (KeyError, TypeError):
-        return None
+    """A parameter of a node in the replay; None if it is unknown.
+
+    Raises
+    ------
+    InputError
+        The file of the run's parameters is malformed.
+    """
+    path = run / PARAMETERS
+    return load_sections(path).get(f'/{node}', {}).get(name) if path.is_file() else None

@@ -434,6 +434,21 @@ def test_refine_takes_the_calibration_of_the_run(path, poses, photographed, caps
     assert sorted(load_map(path).markers) == sorted(poses)
 
 
+@pytest.mark.parametrize('parameters', ['/tau2_camera: 3', '/tau2_camera: {ros__parameters: [1]}', '[]'])
+def test_a_damaged_file_of_a_runs_parameters_is_not_one_without_the_parameter(path, photographed, capsys, parameters):
+    """It said that the calibration was missing; with one given, the sides of the run counted as unknown."""
+    folder = path.with_name('run')
+    folder.mkdir()
+    file, *calibration = photographed
+    file.rename(folder / 'detections.csv')
+    (folder / 'parameters.yaml').write_text(parameters)
+    for given in ([], calibration):
+        assert run('--marker-size', SIZE, 'refine', path, folder, *given) == 2
+        assert f'{folder / "parameters.yaml"}: not of the form' in capsys.readouterr().err
+    (folder / 'parameters.yaml').write_text('/pose_ekf: {ros__parameters: {gate: 20.0}}')
+    assert run('--marker-size', SIZE, 'refine', path, folder, *calibration) == 0
+
+
 def test_a_run_that_is_not_there_and_a_folder_for_a_map_are_named(path, tmp_path, capsys):
     save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, np.eye(4))}))
     assert run('refine', path, tmp_path / 'run') == 2
