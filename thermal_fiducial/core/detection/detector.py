@@ -14,12 +14,12 @@ from thermal_fiducial.core.detection.partial.partial_markers import PartialMarke
 from thermal_fiducial.core.detection.patterns import Decoder, Dictionary
 from thermal_fiducial.core.detection.prediction.frame import Frame
 from thermal_fiducial.core.detection.prediction.known_markers import among, depths, ExpectedMarkers, KnownMarkers
-from thermal_fiducial.core.detection.prediction.tracking import MotionTrack, predict_frame
+from thermal_fiducial.core.detection.prediction.tracking import Guide, MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses, solve_marker_poses
 from thermal_fiducial.core.geometry.reprojection import corners_of_faces
-from thermal_fiducial.core.measurements import CameraPose, marker_rows, Markers, whole_ns
+from thermal_fiducial.core.measurements import marker_rows, Markers, whole_ns
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
@@ -87,10 +87,8 @@ class MarkerDetector:
         camera.require_size_of(counts)
         config, known, history = self.config, self._known, self._history
         prediction = predict_frame(stamp_ns, prior, history.track, config.time_offset_std)
-        pose = prediction.pose
-        T_camera_map = None if pose is None else se3.inverse(pose.T_map_camera)
-        # By which known markers are looked for.
-        guide = pose if config.guided and len(known.ids) else None
+        guide = prediction.guide if config.guided and len(known.ids) else None
+        T_camera_map = None if prediction.guide is None else prediction.guide.T_camera_map
         keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
         frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)
         found, history = self._finder.find(frame, history, known, guide, config)
@@ -120,16 +118,16 @@ class MarkerDetector:
         poses = planar_poses(at, covariances, sizes)
         return choose_branches(poses, at, covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
 
-    def _with_partial(self, rows: Markers, frame: Frame, scale: GrayScale, guide: CameraPose) -> Markers:
+    def _with_partial(self, rows: Markers, frame: Frame, scale: GrayScale, guide: Guide) -> Markers:
         """The rows of whole markers, and those of known ones that are partially visible from the ``guide``."""
-        found_ids, T_camera_map = rows['id'].astype(np.int64), se3.inverse(guide.T_map_camera)
-        candidates = self._known.partially_visible(T_camera_map, frame.camera, found_ids)
+        found_ids = rows['id'].astype(np.int64)
+        candidates = self._known.partially_visible(guide.T_camera_map, frame.camera, found_ids)
         position_std_m = math.sqrt(np.trace(guide.covariance[:3, :3]))
         ids, corners = self._partial.look(frame, scale, candidates, position_std_m, self.config)
         if len(ids) == 0:
             return rows
         at = ImagePoints.at(corners.corners_px, frame.camera)
-        poses = self._poses(ids, corners.covariances, at, T_camera_map)
+        poses = self._poses(ids, corners.covariances, at, guide.T_camera_map)
         partial = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
         rows = np.concatenate([rows, partial])
         return np.asarray(rows[np.argsort(rows['id'], kind='stable')])

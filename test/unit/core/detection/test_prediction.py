@@ -37,7 +37,7 @@ def predicted(prior, time_offset_std=0.03):
 @pytest.mark.parametrize('offset_s', [0.0, -0.060, 0.035])
 def test_odometry_is_read_at_the_frame_s_stamp_in_its_own_clock(offset_s):
     found = predicted(motion_prior(*states(offset_s), clock_offset=offset_s))
-    np.testing.assert_allclose(found.pose.T_map_camera, np.eye(4), atol=1e-3)
+    np.testing.assert_allclose(found.guide.T_camera_map, np.eye(4), atol=1e-3)
     np.testing.assert_allclose(found.twist.value[:3], VELOCITY, atol=0.02)
 
 
@@ -45,7 +45,7 @@ def test_odometry_is_read_at_the_frame_s_stamp_in_its_own_clock(offset_s):
 def test_odometry_that_is_late_gives_both_twist_and_pose_or_neither(age_s, holds):
     """The newest state is so old."""
     found = predicted(motion_prior(*states(-0.010 - age_s), clock_offset=0.0))
-    assert (found.twist is not None) == (found.pose is not None) == holds
+    assert (found.twist is not None) == (found.guide is not None) == holds
 
 
 def test_slow_odometry_shows_an_acceleration():
@@ -74,7 +74,7 @@ def test_slow_odometry_shows_an_acceleration():
 
 
 def position_std(prediction):
-    return np.sqrt(np.trace(prediction.pose.covariance[:3, :3]))
+    return np.sqrt(np.trace(prediction.guide.covariance[:3, :3]))
 
 
 def test_an_unknown_clock_offset_widens_the_predicted_motion_and_pose():
@@ -109,7 +109,7 @@ def test_a_velocity_that_the_filter_does_not_know_blurs_no_frame():
 def test_impossible_odometry_is_left_alone():
     found = predicted(motion_prior(*(replace(state, angular_velocity_body=np.full(3, 1e3)) for state in states())))
     assert found.twist is None
-    assert found.pose is None
+    assert found.guide is None
 
 
 @pytest.mark.parametrize('offset_s', [pytest.param(0.0, marks=pytest.mark.nightly), 0.035])

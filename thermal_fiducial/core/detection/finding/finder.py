@@ -24,13 +24,11 @@ from thermal_fiducial.core.detection.prediction.known_markers import (
     FoundMarkers,
     KnownMarkers,
 )
-from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
+from thermal_fiducial.core.detection.prediction.tracking import Guide, MotionTrack
 from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
 from thermal_fiducial.core.geometry.reprojection import diagonals, sides_px, turned
-from thermal_fiducial.core.geometry.se3 import inverse
-from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS
 
 # Polarity: memory in frames that show markers, and the surplus of markers of one polarity from which on it is certain.
@@ -103,7 +101,7 @@ class MarkerFinder:
         frame: Frame,
         history: FrameHistory,
         known: KnownMarkers,
-        guide: CameraPose | None,
+        guide: Guide | None,
         config: ArucoDetectorConfig,
     ) -> tuple[FoundMarkers, FrameHistory]:
         """Markers at the frame's stamp, accurate to a pixel or two, and the history with the blind search after it.
@@ -134,7 +132,7 @@ class MarkerFinder:
         twist: Twist,
         history: FrameHistory,
         known: KnownMarkers,
-        guide: CameraPose | None,
+        guide: Guide | None,
         config: ArucoDetectorConfig,
     ) -> tuple[FoundMarkers, int, ExpectedMarkers | None]:
         """Markers found at their predictions, from the last frame, else from the map.
@@ -149,7 +147,7 @@ class MarkerFinder:
         found, in_map = followed(frame, twist, last, places, self._decoder, config), None
         lost = ~among(last.ids, found.ids)
         if guide is not None:
-            in_map = known.expected(inverse(guide.T_map_camera), frame.camera, config.min_side_px, without=found.ids)
+            in_map = known.expected(guide.T_camera_map, frame.camera, config.min_side_px, without=found.ids)
             lost &= ~among(last.ids, known.ids)
         missing = last.only(lost) if in_map is None else in_map.joined(last.only(lost))
         number = len(found.ids) + len(missing.ids)
@@ -191,7 +189,7 @@ class MarkerFinder:
         frame: Frame,
         twist: Twist,
         missing: ExpectedMarkers,
-        guide: CameraPose,
+        guide: Guide,
         history: FrameHistory,
         config: ArucoDetectorConfig,
     ) -> FoundMarkers:
@@ -209,7 +207,7 @@ class MarkerFinder:
             missing.ids,
             places.at.px + displaced,
             places.flow.mean(axis=1),
-            turned(guide.covariance, guide.T_map_camera[:3, :3].T),
+            turned(guide.covariance, guide.T_camera_map[:3, :3]),
             _FARTHEST * frame.camera.width,
             history.polarities(config.polarity),
             self._decoder,

@@ -21,7 +21,6 @@ from thermal_fiducial.core.detection.prediction.twist import (
 from thermal_fiducial.core.error_model import UNKNOWN_ACCELERATION
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import twist_transfer
-from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS, Stacked
 
@@ -168,13 +167,23 @@ class MotionTrack:
 
 
 @dataclass(frozen=True, slots=True)
+class Guide:
+    """Pose of the camera at a frame by recent odometry, by which known markers are looked for."""
+
+    #: (4, 4)
+    T_camera_map: FloatArray
+    #: (6, 6), ROS convention, in ``map`` [m, rad]
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class FramePrediction:
     """Motion and pose of the camera at a frame, predicted before its image is used."""
 
     #: of the camera; None: unknown
     twist: Twist | None
     #: by recent odometry; None without
-    pose: CameraPose | None
+    guide: Guide | None
 
 
 def predict_frame(
@@ -207,4 +216,5 @@ def predict_frame(
         return FramePrediction(None, None)
     nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns))
     dt = (odometry_ns - nearest.stamp_ns) / SECOND_NS
-    return FramePrediction(twist, extrapolated(nearest, dt, stamp_ns, track.T_body_camera, clock_std_s).pose)
+    pose = extrapolated(nearest, dt, stamp_ns, track.T_body_camera, clock_std_s).pose
+    return FramePrediction(twist, Guide(se3.inverse(pose.T_map_camera), pose.covariance))
