@@ -10,7 +10,7 @@ from thermal_fiducial.config import MarkerMapperConfig, MOST_KEYFRAMES
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, reproject
-from thermal_fiducial.core.geometry.se3 import rotation_angle
+from thermal_fiducial.core.geometry.se3 import turn_between
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import UNAMBIGUOUS
@@ -121,7 +121,7 @@ def decide(snapshot: Snapshot, marker_id: int, size: float, alternatives: Sequen
     outcomes.sort(key=lambda outcome: outcome[0])
     cost, best = outcomes[0]
     for other_cost, other in outcomes[1:]:
-        apart = rotation_angle(best.T_map_marker[:3, :3].T @ other.T_map_marker[:3, :3])
+        apart = turn_between(best.T_map_marker, other.T_map_marker)
         if apart > SAME_POSE and other_cost - cost < UNAMBIGUOUS:
             return None
     return best

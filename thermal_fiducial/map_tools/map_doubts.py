@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from thermal_fiducial.core.geometry.se3 import rotation_angle
+from thermal_fiducial.core.geometry.se3 import turn_between
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.wording import marker_names
 
@@ -71,7 +71,7 @@ def _overlaps(markers: Sequence[MapMarker]) -> list[Doubt]:
         # Half of the distance at which squares cover each other however they are turned.
         for j in np.flatnonzero(near < 0.25 * (m.size + sizes[i + 1 :])).tolist():
             other = markers[i + 1 + j]
-            facing = rotation_angle(m.T_map_marker[:3, :3].T @ other.T_map_marker[:3, :3])
+            facing = turn_between(m.T_map_marker, other.T_map_marker)
             apart = f'{near[j]:.3f} m and {np.rad2deg(float(facing)):.0f} deg apart'
             found.append(Doubt(f'markers {m.id} and {other.id} overlap: {apart}', m.trusted and other.trusted))
     return found

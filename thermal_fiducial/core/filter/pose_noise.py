@@ -17,7 +17,7 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import covariance_root
 from thermal_fiducial.core.geometry.plausibility import LEAST_INDEPENDENT
-from thermal_fiducial.core.geometry.se3 import rotation_angle, skew
+from thermal_fiducial.core.geometry.se3 import skew, turn_between
 from thermal_fiducial.core.measurements import NOTHING_KNOWN
 from thermal_fiducial.core.types import FloatArray
 
@@ -102,7 +102,7 @@ class BodyPose:
         variances = self.shape.diagonal()
         distance = math.sqrt(float(variances[3:].sum() / variances[:3].sum()))
         T_last, T = last.T_map_body, self.T_map_body
-        turned = float(rotation_angle(T_last[:3, :3].T @ T[:3, :3]))
+        turned = float(turn_between(T_last, T))
         moved = float(np.linalg.norm(T[:3, 3] - T_last[:3, 3])) / distance
         return math.exp(-(turned + moved) / angle + log_overlap(last.shape, self.shape))
 

@@ -191,3 +191,8 @@ def rotation_angle(R: npt.ArrayLike) -> FloatArray:
     x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
     trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
     return np.asarray(np.arctan2(np.sqrt(x * x + y * y + z * z), trace - 1.0))
+
+
+def turn_between(T: FloatArray, other: FloatArray) -> FloatArray:
+    """Angle (...) [rad] by which poses ``other`` (..., 4, 4) are turned against one, ``T`` (4, 4)."""
+    return rotation_angle(T[:3, :3].T @ other[..., :3, :3])

@@ -13,7 +13,7 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import noise_factor, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.se3 import rotation_angle
+from thermal_fiducial.core.geometry.se3 import turn_between
 from thermal_fiducial.core.mapping.keyframes import Displacement
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.mapping.marker_views import MarkerView, MarkerViews, SAME_POSE, Viewpoint
@@ -91,7 +91,7 @@ class Candidate:
                 self._drop_farthest()
             return f'marker {self.id}: its views contradict each other; is its side {self.size:g} m?'
         scale = noise_factor(float(fits.chi2[0]), 8 * len(self.views) - 6)
-        others = np.flatnonzero(rotation_angle(fits.T[0, :3, :3].T @ fits.T[:, :3, :3]) > SAME_POSE)
+        others = np.flatnonzero(turn_between(fits.T[0], fits.T) > SAME_POSE)
         if len(others) and fits.cost[others[0]] - fits.cost[0] < UNAMBIGUOUS * scale:
             return f'planar ambiguity of marker {self.id} unsettled'
         # The noise of each marker is its own.
@@ -103,7 +103,7 @@ class Candidate:
         fits = MarkerViews(self.views, self.size, camera, SystematicErrors()).fit(self._starts)
         poses = list[FloatArray]()
         for T in fits.T[np.isfinite(fits.chi2)]:
-            if all(rotation_angle(T[:3, :3].T @ other[:3, :3]) > SAME_POSE for other in poses):
+            if all(turn_between(T, other) > SAME_POSE for other in poses):
                 poses.append(T)
         return poses
 

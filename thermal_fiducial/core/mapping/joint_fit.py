@@ -21,7 +21,7 @@ from thermal_fiducial.core.error_model import (
 from thermal_fiducial.core.geometry.camera import Camera, inverse_2x2
 from thermal_fiducial.core.geometry.planar_pose import CameraFit, INLIER
 from thermal_fiducial.core.geometry.reprojection import lever_arm, retract, screw_difference, screwed
-from thermal_fiducial.core.geometry.se3 import rotation_angle
+from thermal_fiducial.core.geometry.se3 import turn_between
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.located import Location, Reprojected, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE
@@ -211,7 +211,7 @@ class JointFit:
         None if the corners rule it out, or the markers would be smaller than a pixel from there.
         """
         T = found.pose.T_map_camera
-        apart = (rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE) & self._shown_from(hypotheses)
+        apart = (turn_between(T, hypotheses) > SAME_POSE) & self._shown_from(hypotheses)
         heavy = found.weights >= _HEAVY * found.weights.max()
         extent = np.ptp(self.sight.observed.corners[heavy], axis=(0, 1)) / self.camera.focal_px
         if math.hypot(*extent) > WIDE or not np.any(apart):
@@ -219,10 +219,10 @@ class JointFit:
         starts, weights = hypotheses[apart], found.weights * decision_weights(self.sight.noise_px)
         (T, other), chi2, _ = self.fit.solve(np.stack([T, starts[0]]), weights, inlier=np.inf)
         scale = noise_factor(float(chi2[0]), 8 * len(weights) - 6)
-        if rotation_angle(T[:3, :3].T @ other[:3, :3]) > SAME_POSE and self._shown_from(other):
+        if turn_between(T, other) > SAME_POSE and self._shown_from(other):
             excess = float(chi2[1] - chi2[0]) / scale
             return None if excess > DECISIVE else Alternative(other, excess, is_minimum=True)
-        turns = rotation_angle(T[:3, :3].T @ starts[:, :3, :3])
+        turns = turn_between(T, starts)
         excesses = np.maximum(self.fit.costs(starts, weights, inlier=np.inf) - chi2[0], 0.0) / scale
         far = int(np.argmax(turns**2 * np.exp(-0.5 * excesses)))
         return None if excesses[far] > DECISIVE else Alternative(starts[far], float(excesses[far]), is_minimum=False)

@@ -13,7 +13,7 @@ from thermal_fiducial.core.error_model import covariance_of_one_error, decision_
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit
 from thermal_fiducial.core.geometry.reprojection import difference, screw_difference
-from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
+from thermal_fiducial.core.geometry.se3 import inverse, turn_between
 from thermal_fiducial.core.mapping.joint_fit import Alternative, JointFit, SurveyedFit
 from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
@@ -93,7 +93,7 @@ def _by_odometry(frame: JointFit, found: Location, other: Alternative | None, od
         return found
     for cost, T in ends[1:]:
         excess = cost - ends[0][0]
-        if excess < DECISIVE and rotation_angle(T[:3, :3].T @ ends[0][1][:3, :3]) > SAME_POSE:
+        if excess < DECISIVE and turn_between(T, ends[0][1]) > SAME_POSE:
             # Odometry must not settle it twice, in the mapper and in the filter.
             location = _with_spread(location, unknown_turn(screw_difference(T, location.pose.T_map_camera)))
     return location

@@ -62,6 +62,14 @@ def test_half_turns(half_turn):
     assert se3.rotation_angle(half_turn) == pytest.approx(np.pi)
 
 
+def test_the_turn_between_poses_is_that_of_either_seen_from_the_other():
+    first, other = (se3.transform(se3.so3_exp(w), [1.0, -2.0, 0.5]) for w in ([0.4, -1.0, 0.3], [0.9, 0.2, -0.7]))
+    turned = first @ se3.transform(se3.so3_exp([0.3, 0.0, 0.4]), [5.0, 0.0, 0.0])
+    angles = se3.turn_between(first, np.stack([first, turned, other]))
+    np.testing.assert_allclose(angles[:2], [0.0, 0.5], atol=1e-12)
+    assert se3.turn_between(other, first) == pytest.approx(angles[2], abs=1e-12)
+
+
 def test_transforms_chain_as_their_names_do():
     T_a_b = se3.transform(se3.so3_exp([0.1, 0.2, 0.3]), [1.0, 2.0, 3.0])
     T_b_c = se3.transform(se3.so3_exp([-0.4, 0.0, 1.0]), [0.0, -1.0, 0.5])
