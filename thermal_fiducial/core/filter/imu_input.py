@@ -59,20 +59,20 @@ class Axis:
         self._full_scale, self._saturated = full_scale, saturated
         self._value = math.nan
         self._since_ns = self._count = 0
-        self._longest, self._too_many = 0, FROZEN_SAMPLES
+        self._longest = 0
 
     def is_frozen(self, stamp_ns: int, value: float) -> bool:
         """Whether the run that a sample's value continues is too long."""
+        too_many = max(FROZEN_SAMPLES, FROZEN_FACTOR * self._longest)
         if value != self._value or stamp_ns < self._since_ns:
-            if self._count < self._too_many or not self._longest:
+            if self._count < too_many or not self._longest:
                 self._longest = max(self._longest, self._count)
-                self._too_many = max(FROZEN_SAMPLES, FROZEN_FACTOR * self._longest)
             self._value, self._since_ns, self._count = value, stamp_ns, 0
         self._count += 1
         seconds = (stamp_ns - self._since_ns) / SECOND_NS
         if abs(value) >= self._full_scale:
             return seconds >= self._saturated
-        return seconds >= FROZEN_SECONDS and self._count >= self._too_many and self._longest > 0
+        return seconds >= FROZEN_SECONDS and self._count >= too_many and self._longest > 0
 
 
 class ImuInput:
@@ -99,8 +99,6 @@ class ImuInput:
         self._longest_ns = 0.0
         #: the longest of those that may hide a small step of the clock: a long gap says nothing of these
         self.longest_short_ns = 0.0
-        #: longest step [ns] that is accepted at once, without waiting for a sample that follows
-        self._usual_ns: float = min(GAP_NS, self._max_gap_ns)
         #: by how much the step to the last sample that was used exceeds the longest recent short one, if by far [ns]
         self.excess_ns = 0
         #: jump of the stamps at the last sample that was used [ns]; 0 for a usual step
@@ -116,11 +114,13 @@ class ImuInput:
         frozen = [axis.is_frozen(sample.stamp_ns, value) for axis, value in zip(self._axes, values, strict=True)]
         if any(frozen):
             return Verdict.FROZEN
+        # A longer step waits for samples that follow.
+        usual_ns = min(max(UNUSUAL_FACTOR * self._longest_ns, GAP_NS), self._max_gap_ns)
         if self._last_ns is None:
             self._last_ns = sample.stamp_ns
         elif sample.stamp_ns == self._last_ns:
             return Verdict.REPEATED
-        elif not 0 < sample.stamp_ns - self._last_ns <= self._usual_ns:
+        elif not 0 < sample.stamp_ns - self._last_ns <= usual_ns:
             return Verdict.REPEATED if (sample.stamp_ns, values) in self._used else self._stray(sample.stamp_ns)
         jump_ns = self._passed_again_ns(self._strays) if self._strays else 0
         self._used.append((sample.stamp_ns, values))
@@ -149,7 +149,6 @@ class ImuInput:
             self._longest_ns = max(decayed * self._longest_ns, step_ns)
             short_ns = step_ns if self.excess_ns < SMALLEST_STEP_NS else 0
             self.longest_short_ns = max(decayed * self.longest_short_ns, short_ns)
-            self._usual_ns = min(max(UNUSUAL_FACTOR * self._longest_ns, GAP_NS), self._max_gap_ns)
         self._last_ns, self._strays, self.jump_ns = stamp_ns, None, jump_ns
 
     def _stray(self, stamp_ns: int) -> Verdict:

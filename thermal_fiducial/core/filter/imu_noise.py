@@ -118,20 +118,18 @@ class StructureFunction:
         self._time = 0.0
         #: samples that the next one is compared with, (K,) [s] and (K, 6)
         self._times, self._samples = np.zeros(0), np.zeros((0, 6))
-        self._newest = -math.inf
         self._weights = np.zeros(len(_LAGS))
         self._measured = np.zeros((len(_LAGS), 2))
 
     def add(self, imu: FloatArray, seconds: float) -> None:
         """Add a sample (6,) that follows the last one after ``seconds``."""
         self._time += seconds
-        if self._time - self._newest < _SHORTEST_LAG:
+        if len(self._times) and self._time - self._times[-1] < _SHORTEST_LAG:
             return
         first = int(self._times.searchsorted(self._time - _LAGS[-1]))
         times, samples = self._times[first:], self._samples[first:]
         if len(times):
             self._compare(imu, times, samples)
-        self._newest = self._time
         self._times = np.concatenate((times, (self._time,)))
         self._samples = np.concatenate((samples, imu[None]))
 
@@ -141,7 +139,7 @@ class StructureFunction:
         of_lag = np.rint(np.log2((self._time - times) / _SHORTEST_LAG)) == _OCTAVES[:, None]
         counts = of_lag.sum(axis=1)
         # A plain mean at first, later an exponential one with time constant _MEMORY.
-        new = np.minimum(counts, 1) * min(self._time - self._newest, _MEMORY)
+        new = np.minimum(counts, 1) * min(self._time - times[-1], _MEMORY)
         self._weights = np.minimum(self._weights + new, _MEMORY)
         gain = new / np.maximum(self._weights, _SHORTEST_LAG)
         mean = (of_lag @ squares) / np.maximum(counts, 1)[:, None]
