@@ -74,8 +74,8 @@ class Hypothesis(NamedTuple):
     #: number of latest poses accepted in a row, or refused in a row
     accepted_in_row: int = 1
     refused_in_row: int = 0
-    #: innovation (6,) of the latest refused pose
-    against: FloatArray | None = None
+    #: innovation (6,) of the latest refused pose; zero before the first
+    against: FloatArray = np.zeros(6)
     #: squared standard deviations by which the poses accepted since would have shown an error as that one claims
     shown: float = 0.0
     #: of an alternative: poses that it must accept before it may replace the estimate

@@ -114,9 +114,8 @@ class History:
     def _by_refused(self, main: Hypothesis) -> Estimate:
         """``main`` where its last refused pose has it, at the mean velocity that has led there since it was right."""
         error = np.zeros(SIZE)
-        if main.against is not None:
-            seconds = max(self.imu.newest_ns - main.accepted_ns, _KEPT_EVERY_NS) / SECOND_NS
-            error[POSE], error[VELOCITY] = main.against, main.against[3:] / seconds
+        seconds = max(self.imu.newest_ns - main.accepted_ns, _KEPT_EVERY_NS) / SECOND_NS
+        error[POSE], error[VELOCITY] = main.against, main.against[3:] / seconds
         return replace(main.estimate, state=main.estimate.state.plus(error))
 
     def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None, first_offset: float = 0.0) -> int:

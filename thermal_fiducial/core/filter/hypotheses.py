@@ -59,8 +59,7 @@ def _shown(hypothesis: Hypothesis, innovation: Innovation) -> float:
 
     Without that of its noise, which is all that a vague pose has: its mean is the number of degrees of freedom.
     """
-    if (against := hypothesis.against) is None:
-        return math.inf
+    against = hypothesis.against
     return hypothesis.shown + max(0.0, float(against @ innovation.S_inverse @ against) - len(against))
 
 
@@ -69,7 +68,7 @@ def contradiction(config: PoseEkfConfig, hypothesis: Hypothesis, innovation: Inn
     turn, shift = innovation.value[:3], innovation.value[3:]
     seconds = (innovation.estimate.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
     # The turn has half of the degrees of freedom.
-    if turn @ np.linalg.solve(np.linalg.inv(innovation.S_inverse)[:3, :3], turn) > 0.5 * config.gate:
+    if turn @ np.linalg.solve(innovation.S[:3, :3], turn) > 0.5 * config.gate:
         apart = f'{math.degrees(np.linalg.norm(turn)):.0f} deg apart after {seconds:.2f} s'
         return Condition('poses contradict the gyroscope', f'{apart}; its units, axes, sign? camera_orientation?')
     apart = f'{np.linalg.norm(shift):.2f} m apart after {seconds:.2f} s'
