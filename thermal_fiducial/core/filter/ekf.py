@@ -97,7 +97,7 @@ class PoseEkf:
         if self._input.jump_ns:
             self._camera_clock.imu_jumped(self._input.jump_ns)
         if self._input.excess_ns:
-            self._suspect_steps()
+            self._history.suspect_steps(self._input.excess_ns, jumped=self._input.jump_ns != 0)
         imu, buffer = np.concatenate((sample.angular_velocity, sample.linear_acceleration)), self._history.imu
         seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS
         densities = self._noise.densities(imu, seconds) if len(buffer) else np.zeros(6)
@@ -142,15 +142,6 @@ class PoseEkf:
         self._T_map_first = T_new_old if self._T_map_first is None else T_new_old @ self._T_map_first
 
     # --- steps of the clocks --------------------------------------------------------------------------
-
-    def _suspect_steps(self) -> None:
-        """Allow for steps ahead of the clocks after the newest sample kept, as far as the IMU's stamps suggest them."""
-        excess_ns = self._input.excess_ns
-        self._history.suspect_clock_steps(excess_ns)
-        if self._input.jump_ns and excess_ns >= SMALLEST_STEP_NS:
-            self._history.suspect_jump(excess_ns)
-        elif self._config.estimate_time_offset and excess_ns < SMALLEST_STEP_NS:
-            self._history.suspect_imu_step(excess_ns)
 
     def _in_present_clock(self, pose: CameraPose) -> tuple[CameraPose, int]:
         """``pose`` with all steps of the camera's clock taken out of its stamp, a step that it reveals included.

@@ -15,6 +15,7 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseLog, PoseUpdate
+from thermal_fiducial.core.filter.camera_clock import SMALLEST_STEP_NS
 from thermal_fiducial.core.filter.hypotheses import (
     alternative_to,
     contradiction,
@@ -171,25 +172,23 @@ class History:
             self._camera_steps[first_ns] = size_ns
             self._undo_from(first_ns)
 
-    def suspect_imu_step(self, size_ns: int) -> None:
-        """Allow for a step of the IMU's clock by ``size_ns`` after the newest sample: or samples are lost there."""
-        self._imu_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
+    def suspect_steps(self, size_ns: int, *, jumped: bool) -> None:
+        """Allow for steps ahead of the clocks by ``size_ns`` after the newest sample: or samples are lost there.
 
-    def suspect_clock_steps(self, size_ns: int) -> None:
-        """Allow for a step of all clocks by ``size_ns`` after the newest sample: the next pose shows it."""
-        self._clock_steps.append((self.imu.newest_ns, math.sqrt(_STEPS) * size_ns / SECOND_NS))
-
-    def suspect_jump(self, size_ns: int) -> None:
-        """Allow for a step of the IMU's clock by all of ``size_ns`` after the newest sample: or samples are lost there.
-
-        If it has stepped, the robot is at the end of the jump where it was at its beginning.
+        One of all clocks shows at the next pose. A small one of the IMU's alone is left to the clock offset; after a
+        large one, where its stamps have ``jumped``, the robot is at the end of the jump where it was at its beginning.
         """
-        if self.main:
-            before = self._carried(self.main, self.imu.newest_ns).estimate
+        newest_ns = self.imu.newest_ns
+        self._clock_steps.append((newest_ns, math.sqrt(_STEPS) * size_ns / SECOND_NS))
+        if size_ns < SMALLEST_STEP_NS:
+            if self.config.estimate_time_offset:
+                self._imu_steps.append((newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
+        elif jumped and self.main:
+            before = self._carried(self.main, newest_ns).estimate
             self._stepped = self.main._replace(estimate=replace(before, stamp_ns=before.stamp_ns + size_ns))
 
     def explain_jump(self) -> None:
-        """Drop what :meth:`suspect_jump` allowed for: poses show that samples were lost, the clock has not stepped."""
+        """Take a jump for time that passed: poses show that samples were lost, the clock of the IMU has not stepped."""
         self._stepped = None
 
     def forget_poses(self) -> None:
