@@ -218,12 +218,12 @@ class KeyframeStore:
         stamps = sorted(adjusted.keys() & self.frames.keys())
         if not stamps:
             return Displacement(np.zeros(1, dtype=np.int64), np.eye(4)[None])
-        T = np.stack([adjusted[stamp] @ inverse(self.frames[stamp].T_map_camera) for stamp in stamps])
-        displacement = Displacement(np.array(stamps, dtype=np.int64), _rigid(T))
-        self.frames = {
-            stamp: replace(frame, T_map_camera=adjusted.get(stamp, displacement.at(stamp) @ frame.T_map_camera))
-            for stamp, frame in self.frames.items()
-        }
+        before = np.stack([self.frames[stamp].T_map_camera for stamp in stamps])
+        after = np.stack([adjusted[stamp] for stamp in stamps])
+        displacement = Displacement(np.array(stamps, dtype=np.int64), _rigid(after @ inverse(before)))
+        for stamp, frame in self.frames.items():
+            T_map_camera = adjusted[stamp] if stamp in adjusted else displacement.at(stamp) @ frame.T_map_camera
+            self.frames[stamp] = replace(frame, T_map_camera=T_map_camera)
         return displacement
 
     def _keyframe(
