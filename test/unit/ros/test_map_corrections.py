@@ -7,6 +7,7 @@ import pytest
 from support.flights import config, Flight, timeline
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 from thermal_fiducial.ros.frames.map_corrections import LatePoses, MapCorrections
@@ -58,6 +59,26 @@ def test_no_more_than_the_pose_claims_is_the_maps():
     left = POSE.covariance - of_map(corrections, POSE)
     # rounding of an eigendecomposition
     assert np.linalg.eigvalsh(left)[0] > -1e-15
+
+
+def test_of_two_map_errors_with_one_stamp_it_is_the_later():
+    """A camera's clock that is set back repeats stamps, and poses had the map's error of the ones before."""
+    corrections = MapCorrections()
+    for share in (0.5, 1.0):
+        corrections.note_error(replace(error_of(0), covariance=share * ERROR))
+    np.testing.assert_allclose(of_map(corrections, POSE), ERROR, atol=1e-15)
+
+
+def test_what_is_limited_is_a_covariance():
+    """It had negative variances, so that the filter refused the pose."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        claimed, of_other = (A @ A.T for A in rng.normal(size=(2, 6, 6)) * np.repeat((1e-2, 1e-3), 3)[:, None])
+        corrections = MapCorrections()
+        corrections.note_error(replace(error_of(0), covariance=of_other))
+        shown = of_map(corrections, replace(POSE, covariance=claimed))
+        checked_covariance(shown, 'map error', partial=True)
+        checked_covariance(claimed - shown, 'what is left', partial=True)
 
 
 @pytest.mark.parametrize('late_ms', [50, 600, 900, 2000])

@@ -7,7 +7,6 @@ from dataclasses import replace
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 import numpy as np
 
-from thermal_fiducial.core.error_model import nearest_semidefinite
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
 from thermal_fiducial.core.types import FloatArray
@@ -98,14 +97,26 @@ class MapCorrections:
 
     def in_present_map(self, pose: CameraPose) -> CameraPose:
         """``pose``, given in the map as of its stamp, in the present map, with the covariance of the map's error."""
-        self._error = next((error for error in self._errors if error.stamp_ns == pose.stamp_ns), self._error)
+        # The newest first: a clock that was set back repeats stamps.
+        of_stamp = (error for error in reversed(self._errors) if error.stamp_ns == pose.stamp_ns)
+        self._error = next(of_stamp, self._error)
         error = self._error
         if error is not None and abs(pose.stamp_ns - error.stamp_ns) <= LATEST_NS:
-            # The map's error changes slowly, so the last one is used, limited to what the pose's covariance contains.
-            of_map, relative = error.covariance, pose.covariance - error.covariance
-            if np.linalg.eigvalsh(relative)[0] < 0.0:
-                of_map = pose.covariance - nearest_semidefinite(relative)
-            pose = replace(pose, map_covariance=of_map)
+            pose = replace(pose, map_covariance=_part_of(pose.covariance, error.covariance))
         for T_new_old in self._corrections.since(pose.stamp_ns):
             pose = in_moved_map(pose, T_new_old)
         return pose
+
+
+def _part_of(covariance: FloatArray, of_map: FloatArray) -> FloatArray:
+    """The map's error ``of_map`` (6, 6), at most what the ``covariance`` (6, 6) of a pose contains along any axis.
+
+    It changes slowly, so that of another pose is used where that of this one is missing.
+    """
+    root = np.linalg.cholesky(covariance)
+    units = np.linalg.inv(root)
+    shares, axes = np.linalg.eigh(units @ of_map @ units.T)
+    if shares[-1] <= 1.0:
+        return of_map
+    along = root @ axes
+    return np.asarray((along * np.clip(shares, 0.0, 1.0)) @ along.T)
