@@ -110,6 +110,8 @@ class PoseEkf:
         ``pose.stamp_ns`` is in the camera's clock; the clock offset, parameter and estimate, is added here.
         """
         stamp_ns = pose.stamp_ns
+        if fault := _fault_of(pose):
+            return PoseUpdate(stamp_ns, False, f'refused: {fault}', np.nan)
         off_grid_ns = self._frame_grid.off_grid(stamp_ns) if self._config.estimate_time_offset else 0
         if self._T_map_first is not None:
             pose = in_moved_map(pose, inverse(self._T_map_first))
@@ -125,13 +127,6 @@ class PoseEkf:
         """Why a pose cannot be used; empty if it can. It may take the place of poses with other stamps."""
         if self._history.main is None and self._camera_clock.in_question:
             return CLOCK_JUMPED
-        try:
-            require_pose(pose.T_map_camera, 'camera pose')
-            checked_covariance(pose.covariance, 'covariance')
-            checked_covariance(pose.map_covariance, 'map_covariance', partial=True)
-            checked_covariance(pose.covariance - pose.map_covariance, 'covariance without map_covariance', partial=True)
-        except InputError as error:
-            return f'refused: {error}'
         return self._history.untimely(pose, instead_of)
 
     def move_map(self, T_new_old: FloatArray) -> None:
@@ -317,3 +312,15 @@ class PoseEkf:
             'time offset std': self._time_offset_std(main),
         }
         return numbers | of_filter | figures_of(self._history, main, state)
+
+
+def _fault_of(pose: CameraPose) -> str:
+    """What of a pose's numbers cannot be: whoever calls the library has no messages, which are checked; else empty."""
+    try:
+        require_pose(pose.T_map_camera, 'camera pose')
+        checked_covariance(pose.covariance, 'covariance')
+        checked_covariance(pose.map_covariance, 'map_covariance', partial=True)
+        checked_covariance(pose.covariance - pose.map_covariance, 'covariance without map_covariance', partial=True)
+    except InputError as error:
+        return str(error)
+    return ''

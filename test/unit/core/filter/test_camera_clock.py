@@ -103,6 +103,20 @@ def test_a_step_is_followed_where_delays_scatter_by_more_than_frames(step):
     assert ekf.resets == 0
 
 
+def test_the_numbers_of_a_pose_are_checked_once_also_at_a_step(monkeypatch):
+    """Each was checked up to three times there: as it came, with the step taken out, and before it was inserted."""
+    checked = []
+    monkeypatch.setattr('thermal_fiducial.core.filter.ekf.require_pose', lambda T, what: checked.append(what))
+    ekf, arrivals = PoseEkf(config()), list(stepping(Flight(seed=3, seconds=FOLLOWED), 0.3))
+    for item in arrivals:
+        if isinstance(item, ImuSample):
+            ekf.add_imu(item)
+        else:
+            ekf.add_pose(item)
+    assert ekf.diagnostics()['time offset'] == pytest.approx(-0.3, abs=0.01)
+    assert len(checked) == sum(not isinstance(item, ImuSample) for item in arrivals)
+
+
 def test_an_unusable_pose_does_not_decide_on_a_step():
     """The fifth behind it, with which the first four would agree."""
     flight, ekf = Flight(seed=3, seconds=FOLLOWED), PoseEkf(config())
