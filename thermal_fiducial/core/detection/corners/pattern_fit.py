@@ -52,9 +52,13 @@ _FALSE_MARKERS = 0.01
 # are wider, they are near the lines between cells, at about this distance [blurs].
 _APART_PX, _FEWEST, _MOST = 1.0, 3, 6
 _APART = 1.3
-# Steps of a fit, and length of the step of a corner after which there is no further one [px]. Size and focus converge
-# slowly together: 0.03 px would leave 0.2 per mille more of the size of 22 px.
-_STEPS, _CONVERGED_PX = 8, 0.02
+# Steps of a fit, and length of the step of a corner after which there is no further one [px], in counts and in pictures
+# for a display. Size and focus converge slowly together: in counts 0.03 px would leave 0.2 per mille more of the size
+# of 22 px. On displays corners are as good with 0.05 as with 0.02 px.
+_STEPS, _CONVERGED_PX = 8, (0.02, 0.05)
+# A step by a new sample of the image alone that is not shorter than this share of the last one is no further one:
+# OpenCV interpolates at thirty-seconds of a pixel, by which such steps may go to and fro by up to 0.03 px.
+_SHORTER = 0.5
 # Length of a step of the corners [px], and distance of the blur from that of the pattern as it is modelled [blurs of
 # the optics], up to which that is still the same: the image is sampled again, and nothing else. After 0.3 px, markers
 # out of focus would be off by 0.5 to 1.3 per mille. The pattern of a blur that is a third too small makes them 4 per
@@ -175,7 +179,7 @@ def fitted_patterns(
     floor = OF_DISPLAYED_PATTERN_PX if frame.displayed else OF_PATTERN_PX
     corners = fit.corners_px + square.moved.reshape(-1, 4, 2)
     doubt = square.doubt * squared_sides(corners).mean(axis=1)
-    doubt = np.where(fit.step_px > _CONVERGED_PX, np.maximum(doubt, fit.step_px**2), doubt)
+    doubt = np.where(fit.step_px > _CONVERGED_PX[frame.displayed], np.maximum(doubt, fit.step_px**2), doubt)
     off = np.abs(corners - start.px).max(axis=(1, 2)) * decoder.cells / sides_px(start.px)
     covariances = square.corner_covariances + floor**2 * _EYE
     small = too_small_for_sides(start.px, decoder.cells, frame.blur_px)
@@ -200,13 +204,15 @@ def fit_patterns(
     # Which samples are known changes with the corners.
     alone = (widths(quads) > _ALONE * blurs_px * decoder.cells) & at.known.all(axis=1)
     same_px, same_blur = (np.where(alone, _SAME_ALONE, same) for same in (_SAME_PX, _SAME_BLUR))
+    converged_px, last = _CONVERGED_PX[view.displayed], np.full(len(quads), np.inf)
     for left in reversed(range(_STEPS)):
         information, product = prior.normal_equations(at)
         move = _step(information, product)
         quads, blur = _moved(at, move, blur_px)
         step = np.abs(quads - at.corners_px).max(axis=(1, 2))
         far = (step > same_px) | (np.abs(blur - at.blur) > same_blur * blur_px)
-        anew, again = np.flatnonzero(far), np.flatnonzero(~far & (step > _CONVERGED_PX))
+        anew, again = np.flatnonzero(far), np.flatnonzero(~far & (step > converged_px) & (step < _SHORTER * last))
+        last = step
         if left == 0 or not len(anew) + len(again):
             break
         if len(anew):
