@@ -88,12 +88,14 @@ def refine(
     clear = np.abs(found.cnr).min() > CLEAR_CNR
     columns = OF_CLEAR if clear else OF_FAINT
     twist, places = frame.twist, found.places
+    # Markers whose places are accurate to a pixel or two, no better.
+    rough = ~found.certain
     for _ in range(_ROUNDS_ON_DISPLAYS if frame.displayed else _ROUNDS):
         blur, before = motion_blur(frame, places, twist), scale
         start = places.at.at_pixels(places.at.px + blur.shift)
         bent = frame.displayed and blur.to_tails is not None
         shown = frame.in_counts(scale.counts) if bent else frame
-        refined = _measured(shown, found, start, blur, columns, decoder)
+        refined = _measured(shown, found, start, blur, columns, decoder, rough)
         markers = _at_stamp(frame, found.ids, places, blur, refined, twist, track, decoder.cells)
         if bent:
             scale = _shown_scale(frame, scale, markers, start, decoder)
@@ -101,7 +103,7 @@ def refine(
         settled = change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX and not (bent and scale.differs(before))
         if markers.twist is None or settled:
             break
-        twist, places = markers.twist, markers.places
+        twist, places, rough = markers.twist, markers.places, np.zeros_like(rough)
     return markers, scale
 
 
@@ -116,10 +118,22 @@ def _shown_scale(
 
 
 def _measured(
-    frame: Frame, found: FoundMarkers, start: ImagePoints, blur: MotionBlur, columns: int, decoder: Decoder
+    frame: Frame,
+    found: FoundMarkers,
+    start: ImagePoints,
+    blur: MotionBlur,
+    columns: int,
+    decoder: Decoder,
+    rough: BoolArray,
 ) -> RefinedCorners:
-    """Corners of N markers in the image: by their sides, or by their whole patterns."""
+    """Corners of N markers in the image: by their sides, or by their whole patterns.
+
+    ``rough`` (N,): whether ``start`` (N, 4) is accurate to a pixel or two, else to a tenth of a cell.
+    """
     whole = too_blurred_for_sides(start.px, decoder.cells, frame.blur_px, blur)
+    if frame.displayed:
+        # All are fitted as patterns: sides are where fits begin, and that is known of the others.
+        whole |= ~rough
     if whole.all():
         return _by_patterns(frame, found, start, blur, decoder)
     others, of_sides = (start.only(~whole), blur.only(~whole)) if whole.any() else (start, blur)
