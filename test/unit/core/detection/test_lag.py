@@ -224,6 +224,16 @@ def test_a_marker_in_motion_shows_the_gray_scale_of_a_display(cell, lag_blur, be
     assert np.abs(np.polyval(zero_and_unit, scale.counts[levels]) - true).max() < allowed
 
 
+@pytest.mark.parametrize(('settled', 'change', 'differs'), [(0, 0.01, 0), (0, 0.03, 1), (1, 0.03, 0), (1, 0.07, 1)])
+def test_a_gray_scale_that_has_settled_is_as_good_as_what_few_markers_show(settled, change, differs):
+    """Changes of 0.03 from frame to frame are those of an estimate by one or two markers; zero and unit are free."""
+    levels = np.arange(256.0)
+    before = UNKNOWN_SCALE._replace(settled=bool(settled))
+    bent = levels + change * 255.0 * math.sqrt(2.0) * np.cos(4.0 * math.pi * levels / 255.0)
+    now = UNKNOWN_SCALE._replace(counts=7.0 + 3.0 * bent)
+    assert now.differs(before) == bool(differs)
+
+
 @pytest.mark.parametrize(
     ('cell', 'lag_blur', 'white', 'allowed'),
     [(7, (1.7, 0.0), 0.75, 0.04), (7, (3.0, 0.0), 0.5, 0.04), (9, (4.0, 2.0), 0.75, 0.13)],

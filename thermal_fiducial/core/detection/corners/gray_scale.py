@@ -8,6 +8,7 @@ of the gray levels, and the mean gray level where the terms give the same count.
 gray levels have noise.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -31,9 +32,10 @@ _DENSITY, _ROUNDS = 4, 3
 # Parts of the range of counts, of which each gets its mean gray level, and least number of samples in one.
 _PARTS, _FEWEST = 64, 5
 # Change of the gray scale, root mean square over what markers show and as a share of that, after which other corners
-# follow: across an edge 2.5 px wide, lag tails that are wrong by it displace the middle by 0.05 px. With 0.03, a flight
-# behind a plateau equalisation that begins in motion is off by a pixel first.
-_MATTERS = 0.02
+# follow: until it has settled, and then. Across an edge 2.5 px wide, lag tails that are wrong by 0.02 displace the
+# middle by 0.05 px; with 0.03, a flight behind a plateau equalisation that begins in motion is off by a pixel first.
+# What one or two markers show of a scale that has settled changes by 0.02 to 0.04 from one refinement to the next.
+_MATTERS_AT_FIRST, _MATTERS = 0.02, 0.05
 
 
 class GrayScale(NamedTuple):
@@ -43,13 +45,16 @@ class GrayScale(NamedTuple):
     counts: FloatArray
     #: levels from the darkest to the brightest one that markers show
     shown: slice
+    #: whether it has been about the same in two frames
+    settled: bool = False
 
-    def differs(self, other: 'GrayScale') -> bool:
-        """Whether other corners follow from another gray scale."""
-        counts, others = self.counts[self.shown], other.counts[self.shown]
-        of_unit = np.stack([others, np.ones_like(others)], axis=1)
-        change = counts - of_unit @ np.linalg.lstsq(of_unit, counts, rcond=None)[0]
-        return bool(change.std() > _MATTERS * np.ptp(counts))
+    def differs(self, before: 'GrayScale') -> bool:
+        """Whether other corners follow from it than from the one that was known ``before``."""
+        counts, others = self.counts[self.shown], before.counts[self.shown]
+        (variance, common), (_, others_variance) = np.cov(counts, others, bias=True)
+        # What a linear function of the other one leaves.
+        left = math.sqrt(max(variance - common * common / (others_variance + TINY), 0.0))
+        return left > (_MATTERS if before.settled else _MATTERS_AT_FIRST) * float(np.ptp(counts))
 
     def shown_by(
         self, view: PatternView, corners_px: FloatArray, ids: IntArray, decoder: Decoder, blur_px: float
@@ -77,7 +82,7 @@ class GrayScale(NamedTuple):
             rest = grid.patches(fitted(terms, products, (counts - counts[:, :1]) * known, None)[1])
             left = Unevenness.shown(pattern, rest, grid.patches(known.astype(np.float32)), apart_px).left(rest)
             scale = _by_means((counts - left.reshape(counts.shape))[known], gray[known], scale)
-        return scale
+        return scale._replace(settled=self.settled)
 
 
 #: That of a display of which nothing is known: linear.

@@ -87,7 +87,7 @@ def refine(
         return RefinedMarkers(found.ids, corners, MotionBlur.none(0), corners, found.places, frame.twist), scale
     clear = np.abs(found.cnr).min() > CLEAR_CNR
     columns = OF_CLEAR if clear else OF_FAINT
-    twist, places = frame.twist, found.places
+    twist, places, of_last = frame.twist, found.places, scale
     # Markers whose places are accurate to a pixel or two, no better.
     rough = ~found.certain
     for _ in range(_ROUNDS_ON_DISPLAYS if frame.displayed else _ROUNDS):
@@ -104,6 +104,8 @@ def refine(
         if markers.twist is None or settled:
             break
         twist, places, rough = markers.twist, markers.places, np.zeros_like(rough)
+    if bent:
+        scale = scale._replace(settled=not scale.differs(of_last))
     return markers, scale
 
 
