@@ -249,15 +249,19 @@ def blurred(
     by_lag = lag @ lag.swapaxes(1, 2)
     # Where it changes across the marker, parts are stretched, the oldest and most blurred ones the most.
     stretch = to_cells @ _by_cells(view.lag, white.shape[1]) * white.shape[1]
-    stretched, parts = stretch.astype(np.float32) @ grid.middle, []
-    for weight, age, variance in zip(_WEIGHTS, _AGES, _VARIANCES, strict=True):
-        then = grid.along - (age - 1.0) * lag.swapaxes(0, 1)
-        part = _gaussian(then, white, grid, spread + variance * by_lag, blur, of_optics)
-        farther = np.float32(age - 1.0) * (part.slopes * stretched.swapaxes(0, 1)).sum(axis=0)
-        part = part._replace(value=part.value - farther)
-        parts.append([np.float32(weight) * field for field in part])
-    sums = (np.asarray(np.sum(fields, axis=0), dtype=np.float32) for fields in zip(*parts, strict=True))
-    return PatternModel(*sums), spread + by_lag
+    # Of each age all markers, as one batch.
+    later, parts = _AGES - 1.0, len(_AGES)
+    then = grid.along - (later[:, None, None] * lag.swapaxes(0, 1)[:, None]).reshape(2, -1, 1)
+    of_ages = (spread + _VARIANCES[:, None, None, None] * by_lag).reshape(-1, 2, 2)
+    model = _gaussian(
+        then, np.tile(white, (parts, 1, 1)), grid, of_ages, np.tile(blur, parts), np.tile(of_optics, (parts, 1, 1))
+    )
+    weights = _WEIGHTS.astype(np.float32)
+    value, slopes, wider, surface = (field.reshape(*field.shape[:-2], parts, len(white), -1) for field in model)
+    stretched = (stretch.astype(np.float32) @ grid.middle).swapaxes(0, 1)
+    farther = (weights * later.astype(np.float32)) @ (slopes * stretched[:, None]).sum(axis=0).reshape(parts, -1)
+    value, slopes, wider, surface = (np.tensordot(weights, f, (0, -3)) for f in (value, slopes, wider, surface))
+    return PatternModel(value - farther.reshape(value.shape), slopes, wider, surface), spread + by_lag
 
 
 def _gaussian(
