@@ -98,10 +98,10 @@ class PartialMarkerSearch:
         scale : of the display, as far as whole markers have shown it; counts have none
         unsure_m : standard deviation of the predicted camera position [m]
         """
-        if frame.displayed:
-            frame = frame.in_counts(scale.counts)
         in_view = (self._expected(frame.camera, key, size, T, unsure_m) for key, T, size in candidates)
         largest = sorted((marker for marker in in_view if marker is not None), key=lambda marker: -marker.cell_px)
+        if frame.displayed and largest:
+            frame = frame.in_counts(scale.counts)
         ids, found = list[int](), RefinedCorners.none()
         for marker in largest[:_MOST]:
             corners = self._one(frame, marker, config)
