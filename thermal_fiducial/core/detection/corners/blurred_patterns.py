@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.prediction.frame import lag_tail_places, Saturation, without_tails
-from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, inverse_2x2
 from thermal_fiducial.core.geometry.reprojection import bilinear, seen_between
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY
 
@@ -118,8 +118,12 @@ class PatternGrid(NamedTuple):
 
     def apart_px(self, to_cells: FloatArray) -> FloatArray:
         """Distance (Q,) of samples [px], ``to_cells`` (Q, 2, 2) of :func:`cells_by_pixels`."""
-        (xu, xv), (yu, yv) = np.moveaxis(to_cells, 0, -1)
-        return np.asarray(self.apart / np.sqrt(np.abs(xu * yv - xv * yu)))
+        return np.asarray(self.apart / np.sqrt(np.abs(determinants(to_cells))))
+
+
+def determinants(matrices: FloatArray) -> FloatArray:
+    """Of matrices (Q, 2, 2), (Q,)."""
+    return np.asarray(matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0])
 
 
 @cache
@@ -298,7 +302,8 @@ def _gaussian(
     by_xx += by_xy
     across, down = _between(np.array([-_SURFACE_ENDS, cells + _SURFACE_ENDS]), along, spread)
     surface = (down[:, :, None] * across[:, None]).reshape(count, -1)
-    return PatternModel(*map(grid.by_patches, (value, np.stack([by_x, by_y]), by_xx, surface)))
+    parts = grid.by_patches(np.stack([value, by_x, by_y, by_xx, surface]))
+    return PatternModel(parts[0], parts[1:3], parts[3], parts[4])
 
 
 def linear_terms(
@@ -367,10 +372,8 @@ def _widths(spread: FloatArray) -> FloatArray:
 def cells_by_pixels(quads: FloatArray, cells: int) -> FloatArray:
     """Mean derivatives (Q, 2, 2) of places in markers [cells] by pixels."""
     to_px = _by_cells(quads, cells)
-    area = np.linalg.det(to_px)
-    collapsed = np.abs(area) < TINY
-    to_px[collapsed] = np.eye(2)
-    return np.asarray(np.linalg.inv(to_px))
+    to_px[np.abs(determinants(to_px)) < TINY] = np.eye(2)
+    return inverse_2x2(to_px)
 
 
 def _by_cells(corners: FloatArray, cells: int) -> FloatArray:

@@ -289,7 +289,7 @@ def _noise_variance(at: PatternResiduals, blur_px: float) -> FloatArray:
 
 def _variance_of_samples(at: PatternResiduals, blur_px: float) -> FloatArray:
     """Variance (Q,) that samples would have, were they independent and said as much as the pixels."""
-    return np.asarray(_noise_variance(at, blur_px) / at.grid.apart_px(at.to_cells) ** 2)
+    return np.asarray(_noise_variance(at, blur_px) / at.apart_px**2)
 
 
 def _independent(at: PatternResiduals, blur_px: float) -> FloatArray:
@@ -346,7 +346,7 @@ def _step(information: FloatArray, gradient: FloatArray) -> FloatArray:
 
 def _moved(at: PatternResiduals, step: FloatArray, blur_px: float | FloatArray) -> tuple[FloatArray, FloatArray]:
     """Corners (Q, 4, 2) and blur (Q,) after a step (Q, K), which is limited."""
-    longest = _LONGEST / np.sqrt(np.abs(np.linalg.det(at.to_cells)))[:, None]
+    longest = _LONGEST * (at.apart_px / at.grid.apart)[:, None]
     corners = at.corners_px + np.clip(step[:, CORNERS], -longest, longest).reshape(-1, 2, 4).swapaxes(1, 2)
     wider = np.clip(step[:, BLUR], -_LONGEST_BLUR * blur_px, _LONGEST_BLUR * blur_px)
     return corners, np.clip(at.blur + wider, _BLURS[0] * blur_px, _BLURS[1] * blur_px)

@@ -109,8 +109,11 @@ class PatternResiduals(Stacked):
     spread: FloatArray
     #: (Q, P) gray levels, no background in them
     samples: Float32Array
-    #: (Q, P) which of them are known: the others, and derivatives there, are 0
+    #: (Q, P) which of them are known: the others, and derivatives there, are 0; and their number (Q,), at least 1
     known: BoolArray
+    number: IntArray
+    #: (Q,) distance of samples [px]
+    apart_px: FloatArray
     #: (Q, P) these without the pattern, and times their inverse covariance, for noise with a variance of 1
     rest: Float32Array
     weighted: Float32Array
@@ -147,12 +150,7 @@ class PatternResiduals(Stacked):
     @property
     def pixels(self) -> FloatArray:
         """Pixels (Q,) that the samples cover."""
-        return np.asarray(self.number * self.grid.apart_px(self.to_cells) ** 2)
-
-    @property
-    def number(self) -> IntArray:
-        """Number (Q,) of samples that are known, at least 1."""
-        return np.asarray(np.maximum(self.known.sum(axis=1), 1))
+        return np.asarray(self.number * self.apart_px**2)
 
 
 def linearised(
@@ -167,6 +165,7 @@ def linearised(
     model, spread = blurred(view, to_cells, blur, white, grid)
     places = view.places(quads, grid)
     known = view.known(*places)
+    number, apart_px = np.maximum(np.count_nonzero(known, axis=1), 1), grid.apart_px(to_cells)
     samples = _samples(view.values(*places), grid, known)
     J = linear_terms(model, spread, grid, white.shape[1], displayed=view.displayed)
     nonlinear, terms = J[:, : LINEAR.start], J[:, LINEAR]
@@ -177,7 +176,7 @@ def linearised(
     uneven = None
     if view.displayed:
         pattern, left, counting = (grid.patches(values) for values in (model.value, rest, known.astype(np.float32)))
-        uneven = Unevenness.shown(pattern, left, counting, grid.apart_px(to_cells))
+        uneven = Unevenness.shown(pattern, left, counting, apart_px)
         contrast = (grid.patches(contrast) + uneven.more_contrast[..., None]).reshape(rest.shape)
         whole, sign = np.abs(amounts[:, :1]), np.sign(amounts[:, :1])
         contrast = (sign * np.maximum(sign * contrast, _LEAST_CONTRAST * whole)).astype(np.float32)
@@ -196,9 +195,8 @@ def linearised(
     if uneven is not None:
         information -= uneven.information(J)
         amounts, rest, weighted = fitted(terms, information[:, LINEAR, LINEAR], samples, uneven)
-    return PatternResiduals(
-        quads, blur, to_cells, spread, samples, known, rest, weighted, amounts, J, information, grid, uneven
-    )
+    fit = rest, weighted, amounts, J, information
+    return PatternResiduals(quads, blur, to_cells, spread, samples, known, number, apart_px, *fit, grid, uneven)
 
 
 def _samples(values: Float32Array, grid: PatternGrid, known: BoolArray) -> Float32Array:
