@@ -57,6 +57,12 @@ REMAINING = 1.0 - _TAIL * _FORGOTTEN / (1.0 - _FORGOTTEN)
 SPREAD = math.sqrt(1.0 - _TAIL**2 * _FORGOTTEN / (1.0 - _FORGOTTEN) ** 2)
 
 
+def _by_levels(levels: Counts | Gray, table: Float32Array) -> Float32Array:
+    """Values (height, width) of gray ``levels`` by a ``table`` (256,), whose last one is that of all beyond."""
+    # In half the time of numpy's.
+    return np.asarray(cv2.LUT(cv2.convertScaleAbs(levels), table[None]), dtype=np.float32)
+
+
 @dataclass(frozen=True)
 class Frame:
     """An image with its noise, calibration and the predicted twist of the camera."""
@@ -112,7 +118,7 @@ class Frame:
         Columns differ by an offset of counts, which the scale bends.
         """
         assert self.received is not None
-        image = counts_of_levels.astype(np.float32).take(self.received, mode='clip')
+        image = _by_levels(self.received, counts_of_levels.astype(np.float32))
         noise, ends = pixel_noise(image), (counts_of_levels[0], counts_of_levels[-1])
         return replace(self, pixels=with_columns_corrected(image, noise), noise=noise, ends=ends)
 
@@ -131,7 +137,7 @@ class Saturation(NamedTuple):
         """Of a picture of gray ``levels`` (height, width); None: it is neither black nor white anywhere."""
         if levels.min() > 0 and levels.max() < _LEVELS - 1:
             return None
-        return Saturation(_SIGNS.take(levels, mode='clip'), low, high)
+        return Saturation(_by_levels(levels, _SIGNS), low, high)
 
     def at(self, places: Float32Array) -> Float32Array:
         """Signs (...) at places (2, ...) in the image, 0 where no neighbour is saturated."""
