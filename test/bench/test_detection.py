@@ -15,6 +15,7 @@ import cv2
 from matplotlib.figure import Figure
 import numpy as np
 import pytest
+from rigs.display import CONVERSIONS
 from support.detector_scores import due, is_the_marker, odometry_before
 from support.scenes import camera_of, detector_of
 
@@ -47,6 +48,8 @@ class Case:
     dictionary: str = 'DICT_4X4_50'
     #: of as many seeds
     flights: int = 1
+    #: what makes 8 bits of the counts for all methods; without, ours get the counts and others a linear scale
+    display: str = ''
 
     @property
     def scene(self):
@@ -70,6 +73,10 @@ CASES = {
     'fast, 8 K, lag in steps': Case('fast', 8.0, stepwise=True),
     'fast, 8 K, lag of 14 ms': Case('fast', 8.0, lag=0.014),
     'fast, 0.5 K': Case('fast', 0.5, flights=AT_THE_LIMIT),
+    'slow, 8 K, 8 bits': Case('wall', 8.0, display='linear'),
+    'slow, 8 K, 8 bits, equalised': Case('wall', 8.0, display='plateau'),
+    'fast, 8 K, 8 bits': Case('fast', 8.0, display='linear'),
+    'fast, 8 K, 8 bits, equalised': Case('fast', 8.0, display='plateau'),
     'slow, 8 K, 36h11': Case('wall', 8.0, dictionary='DICT_APRILTAG_36h11'),
     'slow, 0.5 K, 36h11': Case('wall', 0.5, dictionary='DICT_APRILTAG_36h11'),
 }
@@ -115,10 +122,11 @@ def our_detector(case, guided, seed):
     motion_at = case.scene.trajectory(SECONDS, seed)
 
     def prepared(frame):
-        return frame, odometry_before(frame, motion_at, rng) if guided else None
+        image = shown(case, frame) if case.display else frame.counts
+        return frame.stamp_ns, image, odometry_before(frame, motion_at, rng) if guided else None
 
-    def detect(frame, state):
-        rows = detector.detect(frame.stamp_ns, frame.counts, camera, state)
+    def detect(stamp_ns, image, state):
+        rows = detector.detect(stamp_ns, image, camera, state)
         return list(zip(rows['id'].tolist(), corners_px(rows), strict=True))
 
     return prepared, detect
@@ -130,6 +138,11 @@ def eight_bits(counts):
     return np.clip((counts - low) * (255.0 / max(high - low, 1.0)), 0, 255).astype(np.uint8)
 
 
+def shown(case, frame):
+    """The frame in 8 bits, by a linear scale unless its display has another one."""
+    return CONVERSIONS[case.display]()(frame.counts) if case.display == 'plateau' else eight_bits(frame.counts)
+
+
 def opencv_detector(case, refinement):
     """A function of a frame: ID to corners. The conversion to 8 bits is not its time."""
     parameters = cv2.aruco.DetectorParameters()
@@ -139,7 +152,7 @@ def opencv_detector(case, refinement):
     origin = 0.5 if refinement == cv2.aruco.CORNER_REFINE_APRILTAG else 0.0
 
     def prepared(frame):
-        return (eight_bits(frame.counts),)
+        return (shown(case, frame),)
 
     def detect(image):
         corners, ids, _ = detector.detectMarkers(image)
@@ -164,7 +177,7 @@ def locus_detector(case):
         # It counts from the corner of the first pixel.
         return [(int(marker_id), corners - 0.5) for marker_id, corners in zip(found.ids, found.corners, strict=True)]
 
-    return lambda frame: (eight_bits(frame.counts),), detect
+    return lambda frame: (shown(case, frame),), detect
 
 
 def napa_detector(case):
@@ -177,7 +190,7 @@ def napa_detector(case):
     def detect(image):
         return [(tag.tag_id, tag.corners) for tag in detector.detect(image)] if knows else []
 
-    return lambda frame: (eight_bits(frame.counts),), detect
+    return lambda frame: (shown(case, frame),), detect
 
 
 def make(case, method, seed=SEED):
@@ -230,6 +243,16 @@ def time_cells(times):
 
 
 TIMES, POSE_TIMES = {}, {}
+#: Scenes that are timed besides the first one.
+OTHER_TIMES = (
+    'slow, 0.5 K',
+    'fast, 8 K',
+    'slow, 8 K, 8 bits',
+    'slow, 8 K, 8 bits, equalised',
+    'fast, 8 K, 8 bits',
+    'fast, 8 K, 8 bits, equalised',
+    'slow, 8 K, 36h11',
+)
 ROUNDS = 5
 
 
@@ -257,7 +280,7 @@ def pose_times(monkeypatch):
     'scene',
     [
         'slow, 8 K',
-        *(pytest.param(s, marks=pytest.mark.nightly) for s in ('slow, 0.5 K', 'fast, 8 K', 'slow, 8 K, 36h11')),
+        *(pytest.param(s, marks=pytest.mark.nightly) for s in OTHER_TIMES),
     ],
 )
 def test_time(benchmark, pose_times, scene):
@@ -316,7 +339,11 @@ def plot(results):
     """Corner error over contrast, slow, and for all scenes at 8 K."""
     figure = Figure(figsize=(10, 4), layout='constrained')
     left, right = figure.subplots(1, 2, sharey=True)
-    scenes = [name for name, case in CASES.items() if case.contrast == 8.0 and case.dictionary == 'DICT_4X4_50']
+    scenes = [
+        name
+        for name, case in CASES.items()
+        if case.contrast == 8.0 and case.dictionary == 'DICT_4X4_50' and not case.display
+    ]
     shift = np.linspace(-0.32, 0.32, len(METHODS))
     # The plot shows markers of 4 x 4 bits.
     for method, marker, offset in zip(
