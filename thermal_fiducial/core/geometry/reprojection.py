@@ -84,6 +84,22 @@ def twist_transfer(T_body_frame: FloatArray) -> FloatArray:
     return transfer
 
 
+def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
+    """Derivative (..., 2, 6) of the velocity of normalised points (..., 2) at ``depth`` (...) [m] by the twist.
+
+    The image motion of a rigid scene for a camera with twist (v, omega) (F. Chaumette, S. Hutchinson, "Visual servo
+    control I", 2006, eq. 11).
+    """
+    a, b, inverse = x[..., 0], x[..., 1], 1.0 / depth
+    J = np.zeros((*x.shape, 6))
+    J[..., 0, 0] = J[..., 1, 1] = -inverse
+    J[..., 2] = x * inverse[..., None]
+    J[..., 0, 3], J[..., 1, 3] = a * b, 1.0 + b * b
+    J[..., 0, 4], J[..., 1, 4] = -1.0 - a * a, -J[..., 0, 3]
+    J[..., 0, 5], J[..., 1, 5] = b, -a
+    return J
+
+
 def turn_of_pose(R: FloatArray) -> FloatArray:
     """Map (6, 6) of a displacement of a pose, or a twist, by the rotation ``R`` (3, 3) of its axes."""
     turn = np.zeros((6, 6))

@@ -25,9 +25,9 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.camera_frames import pixel_noise, with_columns_corrected
-from thermal_fiducial.core.detection.prediction.twist import interaction, Twist
+from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.reprojection import Real
+from thermal_fiducial.core.geometry.reprojection import interaction, Real
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
 
 #: Least depth of points, used for those behind the camera [m].

@@ -13,14 +13,13 @@ from thermal_fiducial.core.detection.prediction.frame import LEAST_DEPTH
 from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.prediction.twist import (
     corrected,
-    interaction,
     Twist,
     twist_by_odometry,
     UNKNOWN_TWIST,
 )
 from thermal_fiducial.core.error_model import UNKNOWN_ACCELERATION
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.reprojection import twist_transfer
+from thermal_fiducial.core.geometry.reprojection import interaction, twist_transfer
 from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS, Stacked
 

@@ -1,7 +1,6 @@
 """Twist of the camera with its covariance, by odometry or by the motion of corners.
 
-The image motion is that of a rigid scene for a camera with twist (v, omega) (F. Chaumette, S. Hutchinson, "Visual
-servo control I", 2006, eq. 11). The acceleration is that of a line through the odometry, or of the last two frames.
+The acceleration is that of a line through the odometry, or of the last two frames.
 """
 
 from collections.abc import Sequence
@@ -44,18 +43,6 @@ class Twist:
 
 #: Prior of the twist without any information [m^2/s^2, rad^2/s^2]: a brisk flight.
 UNKNOWN_TWIST = Twist(np.zeros(6), 1.5**2 * np.eye(6))
-
-
-def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
-    """Derivative (..., 2, 6) of the velocity of normalised points (..., 2) at ``depth`` (...) [m] by the twist."""
-    a, b, inverse = x[..., 0], x[..., 1], 1.0 / depth
-    J = np.zeros((*x.shape, 6))
-    J[..., 0, 0] = J[..., 1, 1] = -inverse
-    J[..., 2] = x * inverse[..., None]
-    J[..., 0, 3], J[..., 1, 3] = a * b, 1.0 + b * b
-    J[..., 0, 4], J[..., 1, 4] = -1.0 - a * a, -J[..., 0, 3]
-    J[..., 0, 5], J[..., 1, 5] = b, -a
-    return J
 
 
 def twist_by_odometry(
