@@ -62,6 +62,13 @@ DECISION_PX = 0.1
 CHI2_OF_VIEW = 26.1
 #: Errors of successive poses by two cameras last as long as the view, for seconds: this many count as one.
 CORRELATED_POSES = 30.0
+#: Readout time of a rolling shutter [s]: what a calibration leaves of it (0.1 to 0.3 ms where rows are read in 16 ms),
+#: and how much of it may not be declared (cores read their rows in 8 to 33 ms, or all at once). Enter the decision that
+#: it is not as declared, and the estimate (``UndeclaredReadout``).
+READOUT_AS_DECLARED, READOUT_STD = 5e-4, 0.015
+#: Share of an undeclared readout time that corners do not show, as the detector fits squares to what it has sheared: up
+#: to a tenth on rendered frames. Enters the error of that time, and with it poses.
+HIDDEN_OF_READOUT = 0.1
 #: Part of the re-projection error, by bent plates and corner bias, that is no sign of an inconsistent marker [px].
 INCONSISTENT_PX = 0.3
 

@@ -83,7 +83,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
 
     def headline(self) -> str:
         """Doubts about map, file and calibration."""
-        return '; '.join(filter(None, (self._map.doubts, self._misfit.doubt)))
+        return '; '.join(filter(None, (self._map.doubts, self._misfit.doubt, self._poses.doubts)))
 
     def figures(self) -> dict[str, object]:
         """Key-value pairs: size of the map, candidates."""

@@ -94,6 +94,15 @@ def test_a_calibration_that_does_not_fit_the_map_is_doubted(graph, tmp_path, foc
     assert (float(figures['misfit [sigma]']) > 1.5) == doubted
 
 
+def test_a_rolling_shutter_that_is_not_as_declared_is_named(graph, map_file):
+    node = graph.add(MarkerMapperNode, map_file=str(map_file))
+    assert node.headline() == ''
+    node.mapper.readout.seconds, node.mapper.readout.std = 0.0147, 0.0015
+    said = 'rows are read over 14.7 +- 1.5 ms more than readout_time says: add 0.0147'
+    level, reason = node.state()
+    assert (level, node.headline(), said in reason) == (WARN, said, True)
+
+
 def test_saving_keeps_the_previous_file_in_the_history(graph, map_file):
     graph.add(MarkerMapperNode, map_file=str(map_file))
     before = map_file.read_text()

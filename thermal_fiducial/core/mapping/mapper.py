@@ -28,6 +28,7 @@ from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import jump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
+from thermal_fiducial.core.mapping.undeclared_readout import UndeclaredReadout
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
 from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
@@ -89,6 +90,8 @@ class MarkerMapper:
 
     def _begin(self, marker_map: MarkerMap) -> None:
         self._bias = CornerBias()
+        #: a rolling shutter that is not as declared
+        self.readout = UndeclaredReadout()
         self._found: FoundAspect | None = None
         self._initial, self.map = marker_map.copy(), marker_map.with_assumed_draws(self.errors)
         self._new = NewMarkers(self.config.marker_size, size_overrides(self.config.marker_size_overrides))
@@ -125,14 +128,15 @@ class MarkerMapper:
 
     def locate(self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None) -> LocatedFrame:
         """First half of :meth:`process`, up to the pose, which can be published before the map is updated."""
-        raw, errors = Observations.of(markers), self._errors_of(camera)
+        predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
+        raw = self.readout.corrected(Observations.of(markers), camera, predicted)
+        errors = self._errors_of(camera)
         observed = raw
         if errors.aspect_found:
             off_px = errors.aspect_found * of_aspect(raw.corners, camera, errors)
             observed = replace(raw, corners=raw.corners - off_px)
         # Step 2: known and new markers.
         is_known, known = self._in_map(observed)
-        predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
         sight = known if known.trusted.all() else known.only(known.trusted)
         outcome: Location | Refusal = Refusal('no known marker in view')
@@ -140,6 +144,8 @@ class MarkerMapper:
             odometry, last = (None, self._last_at(stamp_ns)) if predicted is None else (predicted.pose, None)
             fit = partial(locate, stamp_ns, camera=camera, model=errors, odometry=odometry, last=last)
             outcome = from_consistent_markers(sight, camera, predicted, fit)
+            if isinstance(outcome, Location):
+                outcome = self.readout.claimed(outcome, camera, predicted)
         elif len(known.sizes):
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
@@ -196,7 +202,7 @@ class MarkerMapper:
                 self._last = frame.pose or self._last
             updated = True
             # Step 7: errors updated.
-            self._bias.add(outcome)
+            self._bias.add(self.readout.explained(outcome, frame.camera, frame.predicted))
             ids, (errors, error_stds) = frame.known.observed.ids.tolist(), frame.known_errors(outcome)
             if self._owns_map:
                 used = outcome.pose.marker_ids
@@ -210,6 +216,9 @@ class MarkerMapper:
                     placed, waiting = self._place_new(frame, outcome.viewpoint)
                     changed |= placed
         self._consistency.add(frame)
+        if isinstance(outcome, Location):
+            # Also where its pose contradicts the odometry: in fast motion this may be why.
+            self.readout.add(outcome, frame.camera, frame.predicted)
         return MapperResult(
             frame.stamp_ns, frame.pose, frame.reason, changed, frozenset(frame.known.observed.ids.tolist()), waiting,
             dict(self._consistency.quarantined), not self.frozen and (changed or updated),

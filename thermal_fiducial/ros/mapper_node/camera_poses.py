@@ -84,6 +84,14 @@ class CameraPoses:
         if alone is not None:
             self._publish(alone)
 
+    @property
+    def doubts(self) -> str:
+        """Rolling shutters that are not as declared, of both cameras."""
+        doubts = [self._mapper.readout.doubt]
+        if self._locator is not None and (doubt := self._locator.readout.doubt):
+            doubts.append(f'{self._config.second_camera}: {doubt}')
+        return '; '.join(filter(None, doubts))
+
     def figures(self) -> dict[str, object]:
         """Counters of the second camera's poses, why the last frame gave none, and the difference of the clocks."""
         second = self._second

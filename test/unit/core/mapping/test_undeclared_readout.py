@@ -1,0 +1,121 @@
+"""Rows that are read over another time than is declared: found from where corners are, and taken out of them."""
+
+import numpy as np
+import pytest
+from support.scenes import motion_prior
+from support.walls import CAMERA, flight, look, rows, SIZE, stamp, wall
+
+from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.error_model import SystematicErrors
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, screw_difference
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.lens_errors import LensErrors
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.mapping.undeclared_readout import UndeclaredReadout
+from thermal_fiducial.core.measurements import Odometry
+
+#: Of the velocity [m/s] and of the turn rate [rad/s] of a filter.
+TWIST_STD = 0.03, 0.01
+#: The camera is the body.
+CONFIG = MarkerMapperConfig(
+    mode='localization', camera_position=(0.0, 0.0, 0.0), camera_orientation=(0.0, 0.0, 0.0, 1.0)
+)
+#: Detector's noise [px].
+SIGMA = 0.05
+
+
+def brisk(t):
+    """T_map_camera at a time [s]: 1 m/s, and turns of 1 rad/s."""
+    T = look([-3.2, 0.5 * np.sin(2.0 * t), 1.5 + 0.2 * np.sin(1.3 * t)], [0.0, 0.0, 1.5])
+    return T @ transform(so3_exp([0.15 * np.sin(3.1 * t), 0.35 * np.sin(2.7 * t + 1.0), 0.05 * np.sin(t)]), np.zeros(3))
+
+
+def read_row_by_row(path, t, poses, readout, rng, lens=None):
+    """Markers of a frame at ``t`` [s] whose corners are where they are when their own rows are read."""
+    ids, middle = np.array(sorted(poses)), (CAMERA.height - 1) / 2.0
+    points = corners_in_map(np.stack([poses[key] for key in ids]), np.full(len(ids), SIZE))
+    v = np.full((len(ids), 4), middle)
+    for _ in range(4):
+        instants = t + readout * (v / (CAMERA.height - 1) - 0.5)
+        T = np.stack([path(instant) for instant in instants.ravel()]).reshape(*v.shape, 4, 4)
+        away = (points - T[..., :3, 3])[..., None, :]
+        px = CAMERA.project((away @ T[..., :3, :3])[..., 0, :])
+        v = px[..., 1]
+    if lens is not None:
+        px = px + LensErrors(px, CAMERA, SystematicErrors()).drawn()[..., lens]
+    seen = CAMERA.contains(px, 5.0).all(axis=-1)
+    return rows(ids[seen], px[seen] + SIGMA * rng.normal(size=px[seen].shape), SIGMA)
+
+
+def flown(path, readout, seconds=5.0, lens=None, lost=TWIST_STD):
+    """A mapper that knows the map after a flight, and each frame's time, pose and true pose.
+
+    ``readout``: the time that is not declared [s], negative where too much is; ``lost``: standard deviations of the
+    twist in every other frame.
+    """
+    rng = np.random.default_rng(5)
+    poses = wall(rng)
+    mapper = MarkerMapper(CONFIG, MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in poses.items()}))
+    located = []
+    for k in range(0, round(30 * seconds), 2):
+        t, truth, stds = k / 30, path(k / 30), np.repeat(lost if k % 4 else TWIST_STD, 3)
+        in_map = screw_difference(path(t + 1e-4), path(t - 1e-4)) / 2e-4
+        twist = np.concatenate([in_map[:3] @ truth[:3, :3], in_map[3:] @ truth[:3, :3]]) + stds * rng.normal(size=6)
+        of_pose = np.diag(np.repeat([0.01, 0.0025], 3) ** 2)
+        odometry = Odometry(stamp(k), truth, twist[:3], twist[3:], of_pose, np.diag(stds**2))
+        seen = read_row_by_row(path, t, poses, readout, rng, lens)
+        located.append((t, mapper.process(stamp(k), seen, CAMERA, motion_prior(odometry)).pose, truth))
+    return mapper, located
+
+
+def nees(located):
+    """Mean squared errors of poses over their claims, per degree of freedom."""
+    errors = [(difference(pose.T_map_camera, truth), pose.covariance) for _, pose, truth in located if pose is not None]
+    return np.mean([error @ np.linalg.solve(C, error) / 6.0 for error, C in errors])
+
+
+@pytest.mark.parametrize('readout', [0.016, -0.016])
+def test_it_is_found_and_poses_are_within_their_claims(readout):
+    mapper, located = flown(brisk, readout)
+    found = mapper.readout
+    # Corners of a detector that fits no squares hide nothing, and the noise is as declared.
+    assert abs(found.seconds - readout) < 3.0 * found.std
+    # A tenth is claimed for what a detector would hide of it.
+    assert found.std < 0.2 * abs(readout)
+    # Errors of the lens are claimed and there are none: 0.02. Uncorrected it is 2.2.
+    assert nees([frame for frame in located if frame[0] > 4.0]) < 0.1
+
+
+def test_velocities_that_a_filter_does_not_know_show_nothing():
+    """In every other frame the filter is lost, and claims so; as information these would find 1 ms."""
+    found = flown(brisk, 0.016, lost=(3.0, 3.0))[0].readout
+    assert abs(found.seconds - 0.016) < 2.0 * found.std
+
+
+def test_what_is_declared_is_left_alone():
+    mapper, located = flown(brisk, 0.0)
+    assert (mapper.readout.seconds, mapper.readout.std, mapper.readout.doubt) == (0.0, 0.0, '')
+    assert nees(located) < 0.5
+
+
+@pytest.mark.parametrize('lens', [1, 4, 6])
+def test_an_error_of_the_lens_is_no_readout(lens):
+    """Slow flights turn one way for seconds: by noise alone these are 10, -9 and 8 ms, 13 to 17 standard deviations."""
+    assert flown(flight, 0.0, seconds=4.0, lens=lens)[0].readout.seconds == 0.0
+
+
+def test_the_warning_says_what_to_write():
+    found = UndeclaredReadout()
+    assert found.doubt == ''
+    found.seconds, found.std = 0.0147, 0.0015
+    assert found.doubt == 'rows are read over 14.7 +- 1.5 ms more than readout_time says: add 0.0147'
+    found.seconds = -0.0074
+    assert found.doubt == 'rows are read over 7.4 +- 1.5 ms less than readout_time says: subtract 0.0074'
+
+
+def test_another_map_needs_evidence_of_its_own():
+    mapper, _ = flown(brisk, 0.016)
+    assert mapper.readout.seconds > 0.0
+    mapper.reset()
+    assert mapper.readout.seconds == 0.0
