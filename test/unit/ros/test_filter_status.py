@@ -11,10 +11,10 @@ from thermal_fiducial.ros.filter_node.filter_status import FilterStatus
 
 def test_a_turned_camera_is_a_warning():
     imu = SimpleNamespace(level=lambda: OK, complaint=str, headline=str)
-    filter_ = SimpleNamespace(condition=TRACKING, lost=False, doubt_of_mount=None)
+    filter_ = SimpleNamespace(condition=TRACKING, lost=False, doubts=[])
     status = FilterStatus(filter_, imu, Mock())
     assert status.state('') == (OK, 'tracking')
     assert status.headline() == 'initialised: tracking'
-    filter_.doubt_of_mount = Condition('camera_orientation is off', 'by 2 deg')
-    assert status.state('') == (WARN, 'tracking; camera_orientation is off: by 2 deg')
-    assert status.headline() == 'initialised: tracking; camera_orientation is off'
+    filter_.doubts = [Condition('camera_orientation is off', 'by 2 deg'), Condition('the map leans', 'by 1 deg')]
+    assert status.state('') == (WARN, 'tracking; camera_orientation is off: by 2 deg; the map leans: by 1 deg')
+    assert status.headline() == 'initialised: tracking; camera_orientation is off; the map leans'

@@ -12,7 +12,7 @@ from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.hypotheses import KNOWN_OFFSET_STD, passes_with_unknown_clock
 from thermal_fiducial.core.filter.imu_input import CLOCK_EVIDENCE, ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
-from thermal_fiducial.core.filter.output import condition_of, figures_of, in_corrected_map, odometry
+from thermal_fiducial.core.filter.output import condition_of, figures_of, in_corrected_map, leaning_map, odometry
 from thermal_fiducial.core.filter.propagation import usable_seconds
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
 from thermal_fiducial.core.geometry.plausibility import checked_covariance, require_pose
@@ -265,10 +265,13 @@ class PoseEkf:
         return condition_of(self._history, self._config)
 
     @property
-    def doubt_of_mount(self) -> Condition | None:
-        """That the camera is turned on the robot by more than is claimed."""
+    def doubts(self) -> list[Condition]:
+        """Parameters that the flight contradicts: the camera is turned on the robot, or the map leans."""
         main = self._history.main
-        return main.estimate.mount.contradiction(self._config.extrinsics_orientation_std) if main else None
+        if main is None:
+            return []
+        turned = main.estimate.mount.contradiction(self._config.extrinsics_orientation_std)
+        return [doubt for doubt in (turned, leaning_map(main.estimate, self._config)) if doubt is not None]
 
     @property
     def status(self) -> str:

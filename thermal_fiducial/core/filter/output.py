@@ -9,7 +9,16 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis
 from thermal_fiducial.core.filter.history import History, OtherEstimate
 from thermal_fiducial.core.filter.imu_buffer import LastSample
-from thermal_fiducial.core.filter.state import CORE, Estimate, NavigationState, POSITION, PUBLISHED, ROTATION, VELOCITY
+from thermal_fiducial.core.filter.state import (
+    CORE,
+    Estimate,
+    GRAVITY,
+    NavigationState,
+    POSITION,
+    PUBLISHED,
+    ROTATION,
+    VELOCITY,
+)
 from thermal_fiducial.core.filter.update import pose_error
 from thermal_fiducial.core.geometry.reprojection import lever_arm, turned, twist_transfer
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, transform
@@ -26,6 +35,8 @@ _AT_REST[:6, 12:] = np.eye(6)
 _RATE_VARIANCES = slice(9 * 13, None, 13)
 #: A correction beyond this [m] is a new start of the filter: spreading it would only prolong the error.
 LARGEST_STEP = 1.0
+# 99.9 % quantile of chi square with two degrees of freedom. Recorded maps lean by 1 deg, and are at 12.3 at most.
+_LEANS = 13.8
 #: Conditions that a node compares with.
 TRACKING, WAITING = Condition('tracking'), Condition('waiting for markers')
 #: Time without an accepted pose after which the filter is said to coast [s].
@@ -158,6 +169,23 @@ def _without_estimate(belief: Belief, config: PoseEkfConfig) -> Condition:
         return belief.contradiction
     begun = belief.alternative
     return Condition('initialising', f'{begun.hits} of {config.initial_poses} poses') if begun else WAITING
+
+
+def leaning_map(estimate: Estimate, config: PoseEkfConfig) -> Condition | None:
+    """That the map leans against gravity by more than is declared.
+
+    Before one heading an accelerometer's bias looks the same; only turns show which of the two it is. What the map
+    itself is bent by is no lean.
+    """
+    tilt, covariance = estimate.state.gravity[:2], estimate.covariance[GRAVITY, GRAVITY]
+    of_map = float(estimate.pose_noise.of_map.diagonal()[3:5].sum())
+    square, claimed = float(tilt @ tilt), config.gravity**2 * (config.map_tilt_std**2 + of_map)
+    if square**2 <= _LEANS * (claimed * square + float(tilt @ covariance @ tilt)):
+        return None
+    # What is declared keeps the estimate near to it.
+    off, says = math.sqrt(square) / config.gravity, math.degrees(config.map_tilt_std)
+    by = f'by {math.degrees(off):.1f} deg or more against gravity, map_tilt_std says {says:.1f}'
+    return Condition('the map leans', f'{by}: level it, or write map_tilt_std: {off:.3f}')
 
 
 def figures_of(history: History, main: Hypothesis, state: NavigationState) -> dict[str, float]:

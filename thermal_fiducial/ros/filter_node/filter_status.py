@@ -52,7 +52,7 @@ class FilterStatus:
     def state(self, doubt: str) -> tuple[bytes, str]:
         """Diagnostic level and message: state of the filter, reason of the last refusal, delay, ``doubt`` of frames."""
         level, words = self._state_of_filter()
-        off = str(self._filter.doubt_of_mount or '')
+        off = '; '.join(map(str, self._filter.doubts))
         level = max(level, self._imu.level(), WARN if doubt or off else OK)
         return level, _joined(_joined(_joined(words, self._imu.complaint()), off), doubt)
 
@@ -70,8 +70,8 @@ class FilterStatus:
             self._headline = f'{again}: {words}' if self._was_lost and not lost else words
             self._words, self._was_lost = words, lost
             self._initialised |= not lost
-        off = self._filter.doubt_of_mount
-        return _joined(_joined(self._headline, self._imu.headline()), off.words if off else '')
+        off = '; '.join(doubt.words for doubt in self._filter.doubts)
+        return _joined(_joined(self._headline, self._imu.headline()), off)
 
     def _condition(self) -> Condition:
         """Condition of the filter; where it lacks poses because their clock is not the IMU's, that."""

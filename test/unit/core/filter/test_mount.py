@@ -26,9 +26,9 @@ def flown(turn_deg):
 
 
 def test_a_turned_camera_is_named():
-    assert flown(0.0).doubt_of_mount is None
+    assert flown(0.0).doubts == []
     # Twelve claimed standard deviations.
-    doubt = flown(6.0).doubt_of_mount
+    doubt = flown(6.0).doubts[0]
     assert doubt.words == 'camera_orientation is off'
     assert '0.5 are claimed; calibrate camera-imu' in doubt.details
 
