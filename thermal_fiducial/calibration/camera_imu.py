@@ -188,7 +188,8 @@ def _require_fit(frames: Sequence[SolvedFrame]) -> None:
 def _row_shifts(frames: Sequence[FrameCorners], camera: Camera, problem: Problem, state: State) -> list[FloatArray]:
     """Rolling-shutter displacement (markers, 4, 2) [px] of the corners to the time of the middle row."""
     points = np.concatenate([frame.points.reshape(-1, 3) for frame in frames])
-    delays = state.readout * np.concatenate([frame.shares(camera.height).ravel() for frame in frames])
+    rows = np.concatenate([frame.corners_px[..., 1].ravel() for frame in frames])
+    delays = state.readout * camera.readout_shares(rows)
     counts = [4 * len(frame.sizes) for frame in frames]
     index = np.repeat(np.arange(len(frames)), counts)
 

@@ -68,10 +68,6 @@ class FrameCorners:
         """Corners (N, 4, 3) in the map [m]."""
         return corners_in_map(self.T_map_marker, self.sizes)
 
-    def shares(self, height: int) -> FloatArray:
-        """Shares (N, 4) of the read-out, -1/2 in the first row and 1/2 in the last."""
-        return self.corners_px[..., 1] / (height - 1) - 0.5
-
     def solved(
         self, camera: Camera, shift: FloatArray | None = None, initial: FloatArray | None = None
     ) -> 'SolvedFrame':
@@ -101,7 +97,7 @@ class FrameCorners:
         rho = (W @ (corners - predicted)[..., None])[..., 0].reshape(-1, 2)
         weight = np.minimum(1.0, _INLIER / np.maximum(np.linalg.norm(rho, axis=1), 1e-12))
         J = (W @ J.reshape(count, 4, 2, 6)).reshape(-1, 2, 6) * weight[:, None, None]
-        moved = J * self.shares(camera.height).reshape(-1, 1, 1)
+        moved = J * camera.readout_shares(self.corners_px[..., 1]).reshape(-1, 1, 1)
         moments = RowMoments(
             np.einsum('nij,nik->jk', J, moved),
             np.einsum('nij,nik->jk', moved, moved),

@@ -206,6 +206,13 @@ class Camera:
         with np.errstate(invalid='ignore'):
             return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
 
+    def readout_shares(self, rows: FloatArray) -> FloatArray:
+        """Shares (...) of the readout of a rolling shutter at which ``rows`` (...) [px] are sampled.
+
+        -1/2 in the first row and 1/2 in the last: the stamp is that of the middle one.
+        """
+        return rows / (self.height - 1) - 0.5
+
     def contains(self, uv: npt.ArrayLike, margin_px: float = 0.0) -> BoolArray:
         """Whether pixels (..., 2) lie in the image, ``margin_px`` away from its border; False for NaN."""
         uv = np.asarray(uv, dtype=np.float64)

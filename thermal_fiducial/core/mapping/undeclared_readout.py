@@ -52,7 +52,7 @@ class UndeclaredReadout:
             return observed
         at, R = ImagePoints.at(observed.corners, camera), predicted.pose.T_map_camera[:3, :3]
         depth = np.repeat(observed.branches[:, :1, 2, 3], 4, axis=1)
-        late = self.seconds * _shares(observed.corners, camera)[..., None, None]
+        late = self.seconds * camera.readout_shares(observed.corners[..., 1])[..., None, None]
         by_twist = late * (at.J @ interaction(at.x, depth))
         moved = by_twist @ (turn_of_pose(R.T) @ predicted.velocity)
         unsure = by_twist @ turned(predicted.velocity_covariance(1.0), R.T) @ by_twist.swapaxes(-1, -2)
@@ -79,7 +79,7 @@ class UndeclaredReadout:
         if predicted is None:
             return
         sight, fit = location.sight, location.reprojection
-        W, shares = whitening(sight.observed.covariances), _shares(sight.observed.corners, camera)
+        W, shares = whitening(sight.observed.covariances), camera.readout_shares(sight.observed.corners[..., 1])
         residuals = (W @ fit.residuals[..., None])[..., 0]
         squared = (residuals * residuals).sum(axis=-1)
         roots = np.sqrt(location.weights[:, None] / np.maximum(squared / INLIER**2, 1.0))[..., None]
@@ -126,11 +126,6 @@ class UndeclaredReadout:
         return f'rows are read over {off:.1f} +- {std:.1f} ms {more} than readout_time says: {add} {1e-3 * off:.4f}'
 
 
-def _shares(corners: FloatArray, camera: Camera) -> FloatArray:
-    """Shares (N, 4) of the readout at which the rows of corners (N, 4, 2) are read, -1/2 to 1/2."""
-    return np.asarray(corners[..., 1] / (camera.height - 1) - 0.5)
-
-
 def _without(Q: FloatArray, errors: FloatArray) -> FloatArray:
     """``errors`` (n, ...) without their parts along the orthonormal directions ``Q`` (n, 6)."""
     return np.asarray(errors - Q @ (Q.T @ errors))
@@ -138,6 +133,6 @@ def _without(Q: FloatArray, errors: FloatArray) -> FloatArray:
 
 def _rates(location: Location, camera: Camera, predicted: PredictedCamera) -> FloatArray:
     """Displacement (N, 4, 2) of the corners of N located markers by each second of the time [px/s]."""
-    shares = _shares(location.sight.observed.corners, camera)
+    shares = camera.readout_shares(location.sight.observed.corners[..., 1])
     moving = location.reprojection.J_camera @ predicted.velocity
     return np.asarray(shares[..., None] * moving.reshape(*shares.shape, 2))

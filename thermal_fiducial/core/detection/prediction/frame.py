@@ -182,7 +182,7 @@ class Places(Stacked):
 
 def delays(rows: FloatArray, frame: Frame) -> FloatArray:
     """Time after the stamp [s] at which ``rows`` (...) are sampled."""
-    return frame.readout * (rows / (frame.camera.height - 1) - 0.5)
+    return frame.readout * frame.camera.readout_shares(rows)
 
 
 def rolling_displacement(
