@@ -68,9 +68,9 @@ class UndeclaredReadout:
 
     def explained(self, location: Location, camera: Camera, predicted: PredictedCamera | None) -> Location:
         """The location with residuals of lens and detector alone: without those by the most likely time."""
-        if predicted is None:
-            return location
         fit, left = location.reprojection, self._likely - self.seconds
+        if predicted is None or left == 0.0:
+            return location
         residuals = fit.residuals - left * _rates(location, camera, predicted)
         return replace(location, reprojection=replace(fit, residuals=residuals))
 
