@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from thermal_fiducial.calibration.board_shape import BoardShape
 from thermal_fiducial.calibration.lens_fit import LensFit
 from thermal_fiducial.calibration.lens_parameters import camera_parameters, MATRIX
 from thermal_fiducial.calibration.targets import Sighting
@@ -40,6 +41,7 @@ class Calibration:
     residuals : V arrays (N, 2) measured minus predicted [px]
     views : (V,) indices of the sightings that were used
     dropped : indices of the sightings rejected as outliers
+    board : its points
     held_out_px : rms error of held-out views, and its standard error
     """
 
@@ -50,6 +52,7 @@ class Calibration:
     residuals: list[FloatArray]
     views: IntArray
     dropped: list[int]
+    board: BoardShape
     held_out_px: tuple[float, float] = (np.nan, np.nan)
 
     @property
@@ -122,32 +125,43 @@ def calibrate_from(
     radius: float = 0.0,
     free: Sequence[int] | None = None,
     drop: bool = True,
+    board_std: float = 0.0,
 ) -> Calibration:
-    """:func:`calibrate` from a ``camera`` and poses ``T`` (V, 4, 4) near the solution; ``drop``: outlying views."""
+    """:func:`calibrate` from a ``camera`` and poses ``T`` (V, 4, 4) near the solution.
+
+    Parameters
+    ----------
+    drop : whether outlying views are dropped
+    board_std : standard deviation of each coordinate of the board's points [m]; 0: they are as described
+    """
     used = np.arange(len(sightings))
     while True:
-        fit = LensFit([sightings[index] for index in used.tolist()], camera, radius, free)
-        camera, T = fit.solve(T)
-        residuals = fit.residuals(camera, T)
+        fit = LensFit([sightings[index] for index in used.tolist()], camera, radius, free, board_std=board_std)
+        state = fit.solve(T)
+        residuals = fit.residuals(state)
         rms = np.array([np.sqrt(np.mean(residual**2)) for residual in residuals])
         keep = rms <= _OUTLIER_RATIO * np.median(rms)
         if not drop or np.all(keep) or np.sum(keep) < LEAST_VIEWS:
             break
-        used, T = used[keep], T[keep]
+        camera, T, used = state.camera, state.T[keep], used[keep]
     dropped = sorted(set(range(len(sightings))) - set(used.tolist()))
     chosen = tuple(range(len(camera.D)) if free is None else sorted(free))
-    return Calibration(camera, chosen, fit.covariance(camera, T), T, residuals, used, dropped)
+    covariance, board = fit.covariance(state), BoardShape(fit.described, state.places)
+    return Calibration(state.camera, chosen, covariance, state.T, residuals, used, dropped, board)
 
 
 def board_pose(sighting: Sighting, camera: Camera) -> FloatArray:
     """T_camera_board (4, 4) by OpenCV on undistorted points."""
     normalised = camera.normalise(sighting.pixels)
+    # ITERATIVE begins with a linear fit of 12 numbers, which a board that is nearly flat does not determine.
     found, rotation, translation = cv2.solvePnP(
-        sighting.points, normalised, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_ITERATIVE
+        sighting.points, normalised, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_SQPNP
     )
-    if not found or not translation[2, 0] > 0.0:
+    T = se3.transform(se3.so3_exp(rotation.reshape(3)), translation.reshape(3))
+    # All points: the origin of a marker map may lie behind the camera.
+    if not found or not np.all(se3.apply(T, sighting.points)[:, 2] > 0.0):
         raise InputError('a view from which no pose of the board follows')
-    return se3.transform(se3.so3_exp(rotation.reshape(3)), translation.reshape(3))
+    return T
 
 
 def _start(sightings: Sequence[Sighting], width: int, height: int, model: str, focal_px: float) -> Camera:

@@ -12,7 +12,7 @@ import numpy as np
 
 from thermal_fiducial.calibration.intrinsics import board_pose, calibrate, calibrate_from, Calibration
 from thermal_fiducial.calibration.lens_check import reaches_corners
-from thermal_fiducial.calibration.lens_fit import LensFit, NEARLY
+from thermal_fiducial.calibration.lens_fit import FittedBoard, LensFit, NEARLY
 from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
@@ -66,14 +66,45 @@ def choose_model(
     *,
     radius: float = 0.0,
     focal_px: float = 600.0,
+    board_std: float = 0.0,
 ) -> tuple[Calibration, dict[str, Calibration]]:
     """The best lens, and the best of each model; see the module's head.
+
+    Where the board may be off by ``board_std`` [m], it is chosen twice: with the board as described, and as it is found
+    with all coefficients of the best model, as a board of another shape looks like a lens of more of them.
 
     Raises
     ------
     InputError
         As :func:`calibrate`; or no model reaches the corners.
     """
+    best, fits = _chosen(sightings, width, height, models, radius, focal_px)
+    if not board_std:
+        return best, fits
+    found = _released(sightings, replace(best, free=tuple(range(len(best.camera.D)))), radius, board_std)
+    best, fits = _chosen(_as_found(sightings, found), width, height, models, radius, focal_px)
+    fits = {model: _released(sightings, fit, radius, board_std) for model, fit in fits.items()}
+    return fits[best.camera.model], fits
+
+
+def _released(sightings: Sequence[Sighting], near: Calibration, radius: float, board_std: float) -> Calibration:
+    """Fit of the same coefficients to the same views, with the points of the board as unknowns."""
+    used = [sightings[index] for index in near.views.tolist()]
+    fit = calibrate_from(
+        used, near.camera, near.T_camera_board, radius=radius, free=near.free, drop=False, board_std=board_std
+    )
+    return replace(fit, views=near.views, dropped=near.dropped, held_out_px=near.held_out_px)
+
+
+def _as_found(sightings: Sequence[Sighting], found: Calibration) -> list[Sighting]:
+    """Sightings of the board as it was found; those that no used view shows stay as described."""
+    return [replace(view, points=np.stack([found.board.found(point) for point in view.points])) for view in sightings]
+
+
+def _chosen(
+    sightings: Sequence[Sighting], width: int, height: int, models: Sequence[str], radius: float, focal_px: float
+) -> tuple[Calibration, dict[str, Calibration]]:
+    """:func:`choose_model` with the board as described."""
     starts = [_start(sightings, width, height, model, radius, focal_px) for model in models]
     # For a fair comparison all models drop the outliers of the best-fitting one.
     reference = min(starts, key=lambda fit: (len(fit.dropped), fit.rms_px))
@@ -154,17 +185,18 @@ def _held_out_squares(sightings: Sequence[Sighting], fit: Calibration, radius: f
     A fold moves a camera by a part of its errors: circles' centroids stay where they are for all views.
     """
     squares = np.zeros(len(sightings))
-    centroids = LensFit(sightings, fit.camera, radius).centroids(fit.camera, fit.T_camera_board)
+    every = LensFit(sightings, fit.camera, radius)
+    centroids = every.centroids(FittedBoard(fit.camera, fit.T_camera_board, every.described))
     # Few views: all but one at a time.
     folds = _FOLDS if len(sightings) >= 2 * _FOLDS else len(sightings)
     index = np.arange(len(sightings))
     for fold in range(folds):
         inside, outside = index[index % folds != fold].tolist(), index[fold::folds].tolist()
         part = _part(sightings, centroids, inside, fit.camera, fit.free)
-        trained, _ = part.solve(fit.T_camera_board[inside])
+        trained = part.solve(fit.T_camera_board[inside]).camera
         held_out = _part(sightings, centroids, outside, trained, None)
-        _, T = held_out.solve(fit.T_camera_board[outside])
-        for view, residual in zip(outside, held_out.residuals(trained, T), strict=True):
+        posed = held_out.solve(fit.T_camera_board[outside])
+        for view, residual in zip(outside, held_out.residuals(posed), strict=True):
             squares[view] = float(np.mean(np.sum(residual**2, axis=1)))
     return squares
 

@@ -1,12 +1,16 @@
-"""Least squares over the intrinsics of a camera and the pose of a board in every view.
+"""Least squares over the intrinsics of a camera, the pose of a board in every view, and the shape of the board.
 
 The residuals use the package's own camera model, so the estimate is consistent with its use. Distortion coefficients
 have a prior that limits the displacement of the image's corner relative to its distance from the centre. It is too weak
 to matter where views reach the corner, and constrains what they do not determine. What is claimed where no view
 reaches follows from real lenses instead (:func:`lens_prior`).
+
+A board that is not exactly as described bends the lens. Its points are unknowns too where ``board_std`` says how well
+they are known: K. Strobl, G. Hirzinger, "More accurate pinhole camera calibration with imperfect planar target", 2011.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,8 +42,23 @@ _TURNS = np.arange(12) * _ANGLE
 _CIRCLE = np.sqrt(3.0 / (2.0 + np.cos(_ANGLE))) * np.stack([np.cos(_TURNS), np.sin(_TURNS), 0.0 * _TURNS], axis=1)
 
 
+class FittedBoard(NamedTuple):
+    """Unknowns of a fit.
+
+    Parameters
+    ----------
+    camera : with the intrinsics
+    T : (V, 4, 4) T_camera_board of each view
+    places : (P, 3) of the board's points [m], in the order of their coordinates as described
+    """
+
+    camera: Camera
+    T: FloatArray
+    places: FloatArray
+
+
 class LensFit:
-    """Levenberg-Marquardt for a camera and its views.
+    """Levenberg-Marquardt for a camera, its views, and the board.
 
     Parameters
     ----------
@@ -50,6 +69,11 @@ class LensFit:
     centroids : for each view the offsets (N, 2) of its circles' centroids from their centres [px], held fixed; None:
         computed from the radius
     converged : relative decrease of the cost at convergence
+    board_std : standard deviation of each coordinate of the board's points [m]; 0: they are as described
+
+    Attributes
+    ----------
+    described : (P, 3) the board's points, in the order of a :class:`FittedBoard`
     """
 
     def __init__(
@@ -62,8 +86,12 @@ class LensFit:
         poses_only: bool = False,
         centroids: Sequence[FloatArray] | None = None,
         converged: float = _CONVERGED,
+        board_std: float = 0.0,
     ) -> None:
-        self._points = np.concatenate([sighting.points for sighting in sightings])
+        points = np.concatenate([sighting.points for sighting in sightings])
+        self.described, point = np.unique(points, axis=0, return_inverse=True)
+        # Of two dimensions by numpy 2.0 alone.
+        self._point = point.reshape(-1)
         self._pixels = np.concatenate([sighting.pixels for sighting in sightings])
         self._lengths = [len(sighting.points) for sighting in sightings]
         self._view = np.repeat(np.arange(len(sightings)), self._lengths)
@@ -80,18 +108,19 @@ class LensFit:
         sigmas = prior_sigmas(camera)
         self._prior = np.append(np.zeros(MATRIX), sigmas**-2)
         self._lacking = np.zeros(len(sigmas) - len(camera.D))
+        self._board_std = board_std
 
-    def solve(self, T: FloatArray) -> tuple[Camera, FloatArray]:
-        """Camera and poses T_camera_board (V, 4, 4), from initial poses."""
-        camera = self._camera
+    def solve(self, T: FloatArray) -> FittedBoard:
+        """All unknowns, from initial poses T_camera_board (V, 4, 4)."""
+        state = FittedBoard(self._camera, T, self.described)
         for _ in range(_ROUNDS):
-            change = self._update_centroids(camera, T)
-            camera, T = self._minimise(camera, T)
+            change = self._update_centroids(state)
+            state = self._minimise(state)
             if change < _SETTLED_PX:
                 break
-        return camera, T
+        return state
 
-    def covariance(self, camera: Camera, T: FloatArray) -> FloatArray:
+    def covariance(self, state: FittedBoard) -> FloatArray:
         """Covariance of fx fy cx cy, all coefficients, held ones too, and decentring that the model lacks.
 
         It has two parts: the noise of the residuals, and the change by the step to the solution with all of them free,
@@ -99,91 +128,105 @@ class LensFit:
         Held-out views do not show a gain below some per cent; a coefficient of five standard deviations may gain less.
         """
         free, self._free = self._free, np.arange(len(self._prior))
-        error = self.error(camera, T)
-        information, _ = self._normal_equations(camera, T, error, np.inf, 0.0)
+        error = self.error(state)
+        information, _ = self._normal_equations(state, error, np.inf)
         variance = float(np.sum(error**2)) / max(1, error.size - len(information))
         count = len(self._prior)
-        to_prior, known = lens_prior(camera)
+        to_prior, known = lens_prior(state.camera)
         information[MATRIX:count, MATRIX:count] += variance * known
+        self._add_board_prior(information, np.zeros(len(information)), state, variance)
         scale = np.sqrt(np.diag(information)) + 1e-12
         inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
-        _, gradient = self._normal_equations(camera, T, error, _HUBER * _noise(error), 0.0)
+        weighted, gradient = self._normal_equations(state, error, _HUBER * _noise(error))
+        self._add_board_prior(weighted, gradient, state, variance)
         gradient[MATRIX:count] -= variance * known @ to_prior
         change = (inverse @ gradient)[:count]
         self._free = free
         return np.asarray(variance * inverse[:count, :count] + np.outer(change, change))
 
-    def residuals(self, camera: Camera, T: FloatArray) -> list[FloatArray]:
+    def residuals(self, state: FittedBoard) -> list[FloatArray]:
         """Measured minus predicted (N, 2) [px] of each view."""
-        return self._by_view(-self.error(camera, T))
+        return self._by_view(-self.error(state))
 
-    def centroids(self, camera: Camera, T: FloatArray) -> list[FloatArray]:
+    def centroids(self, state: FittedBoard) -> list[FloatArray]:
         """Offsets (N, 2) [px] of the circles' centroids from their centres, per view."""
-        self._update_centroids(camera, T)
+        self._update_centroids(state)
         return self._by_view(self._centroid)
 
-    def error(self, camera: Camera, T: FloatArray) -> FloatArray:
+    def error(self, state: FittedBoard) -> FloatArray:
         """Predicted minus measured (N, 2) [px]; large where the model cannot project a point."""
-        predicted = camera.project(_in_camera(T[self._view], self._points)) + self._centroid
+        predicted = state.camera.project(self._in_camera(state)) + self._centroid
         return np.asarray(np.nan_to_num(predicted - self._pixels, nan=1e3))
 
-    def moved(self, camera: Camera, T: FloatArray, step: FloatArray) -> tuple[Camera, FloatArray]:
-        """Camera and poses after a ``step`` (free parameters, then 6 V)."""
-        shared = len(self._free)
+    def moved(self, state: FittedBoard, step: FloatArray) -> FittedBoard:
+        """The unknowns after a ``step``: free parameters, 6 of each pose, and 3 of each point if these are unknowns."""
+        camera, T, places = state
+        shared, poses = len(self._free), len(self._free) + 6 * len(T)
         if shared:
             parameters = camera_parameters(camera)
             parameters[self._free] += step[:shared]
             camera = with_parameters(camera, parameters)
-        turn = step[shared:].reshape(-1, 6)
-        return camera, se3.transform(se3.so3_exp(turn[:, 3:]) @ T[:, :3, :3], T[:, :3, 3] + turn[:, :3])
+        if self._board_std:
+            places = places + step[poses:].reshape(-1, 3)
+        turn = step[shared:poses].reshape(-1, 6)
+        T = se3.transform(se3.so3_exp(turn[:, 3:]) @ T[:, :3, :3], T[:, :3, 3] + turn[:, :3])
+        return FittedBoard(camera, T, places)
 
-    def jacobian(self, camera: Camera, T: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Of :meth:`error`, by the free parameters (N, 2, I) and by the pose of the point's view (N, 2, 6).
+    def jacobian(self, state: FittedBoard) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of :meth:`error`, by the free parameters (N, 2, I), the pose of the view (N, 2, 6) and the point (N, 2, 3).
 
         Circles move like their centres to first order.
         """
-        points = _in_camera(T[self._view], self._points)
-        _, by_point = camera.project_jacobian(points)
-        by_pose = np.concatenate([by_point, -by_point @ se3.skew(points - T[self._view, :3, 3])], axis=-1)
-        by_shared = by_parameters(camera, points, self._free)
-        return np.nan_to_num(by_shared), np.asarray(np.nan_to_num(by_pose))
+        T = state.T[self._view]
+        points = self._in_camera(state)
+        _, by_point = state.camera.project_jacobian(points)
+        by_point = np.nan_to_num(by_point)
+        by_pose = np.concatenate([by_point, -by_point @ se3.skew(points - T[:, :3, 3])], axis=-1)
+        by_shared = by_parameters(state.camera, points, self._free)
+        return np.nan_to_num(by_shared), by_pose, by_point @ T[:, :3, :3]
 
-    def _minimise(self, camera: Camera, T: FloatArray) -> tuple[Camera, FloatArray]:
-        error = self.error(camera, T)
+    def _minimise(self, state: FittedBoard) -> FittedBoard:
+        error = self.error(state)
         noise = _noise(error)
-        cost, damping = self._cost(camera, error, noise), 1e-3
+        cost, damping = self._cost(state, error, noise), 1e-3
         for _ in range(_MAX_STEPS):
-            information, gradient = self._normal_equations(camera, T, error, _HUBER * noise, noise)
+            information, gradient = self._normal_equations(state, error, _HUBER * noise)
+            self._add_lens_prior(information, gradient, state, noise**2)
+            self._add_board_prior(information, gradient, state, noise**2)
             while damping < _MOST_DAMPED:
                 damped = information + damping * np.diag(np.diag(information) + 1e-12)
-                moved = self.moved(camera, T, -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64))
-                after = self.error(*moved)
-                lower = self._cost(moved[0], after, noise)
+                moved = self.moved(state, -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64))
+                after = self.error(moved)
+                lower = self._cost(moved, after, noise)
                 if lower < cost:
                     break
                 damping *= 10.0
             else:
                 break
-            gain, (camera, T), error, damping = (cost - lower) / cost, moved, after, 0.1 * damping
+            gain, state, error, damping = (cost - lower) / cost, moved, after, 0.1 * damping
             if gain < self._converged:
                 break
             noise = min(noise, _noise(error))
-            cost = self._cost(camera, error, noise)
-        return camera, T
+            cost = self._cost(state, error, noise)
+        return state
 
-    def _cost(self, camera: Camera, error: FloatArray, noise: float) -> float:
-        """Huber's: quadratic up to three times the ``noise`` [px], linear beyond; and the prior's."""
+    def _cost(self, state: FittedBoard, error: FloatArray, noise: float) -> float:
+        """Huber's: quadratic up to three times the ``noise`` [px], linear beyond; and the priors'."""
         size, limit = np.abs(error), _HUBER * noise
         misfit = float(np.sum(np.where(size <= limit, 0.5 * size**2, limit * (size - 0.5 * limit))))
-        return misfit + 0.5 * noise**2 * float(self._prior[self._free] @ camera_parameters(camera)[self._free] ** 2)
+        prior = float(self._prior[self._free] @ camera_parameters(state.camera)[self._free] ** 2)
+        if self._board_std:
+            prior += float(np.sum((state.places - self.described) ** 2)) / self._board_std**2
+        return misfit + 0.5 * noise**2 * prior
 
-    def _normal_equations(
-        self, camera: Camera, T: FloatArray, error: FloatArray, limit: float, noise: float
-    ) -> tuple[FloatArray, FloatArray]:
-        weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-12))[self._rows] * self._there[..., None]
-        views, shared = len(T), len(self._free)
-        J = np.concatenate(self.jacobian(camera, T), axis=2)[self._rows].reshape(views, -1, shared + 6)
-        weighted = (J * weight.reshape(views, -1, 1)).swapaxes(1, 2)
+    def _normal_equations(self, state: FittedBoard, error: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
+        """Information and gradient without priors; errors beyond ``limit`` [px] count less."""
+        weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-12))
+        by_shared, by_pose, by_point = self.jacobian(state)
+        views, shared = len(state.T), len(self._free)
+        padded = (weight[self._rows] * self._there[..., None]).reshape(views, -1, 1)
+        J = np.concatenate([by_shared, by_pose], axis=2)[self._rows].reshape(views, -1, shared + 6)
+        weighted = (J * padded).swapaxes(1, 2)
         blocks, slopes = weighted @ J, weighted @ error[self._rows].reshape(views, -1, 1)
         information = np.zeros((shared + 6 * views, shared + 6 * views))
         information[:shared, :shared] = blocks[:, :shared, :shared].sum(axis=0)
@@ -193,20 +236,63 @@ class LensFit:
         of_poses[np.arange(views), :, np.arange(views)] = blocks[:, shared:, shared:]
         information[shared:, shared:] = of_poses.reshape(6 * views, 6 * views)
         gradient = np.concatenate([slopes[:, :shared, 0].sum(axis=0), slopes[:, shared:, 0].reshape(-1)])
-        prior = noise**2 * self._prior[self._free]
-        information[range(shared), range(shared)] += prior
-        gradient[:shared] += prior * np.append(camera_parameters(camera), self._lacking)[self._free]
-        return information, gradient
+        if not self._board_std:
+            return information, gradient
+        own, cross, slope = self._board_equations(by_shared, by_pose, by_point, weight, error)
+        return np.block([[information, cross.T], [cross, own]]), np.concatenate([gradient, slope])
 
-    def _update_centroids(self, camera: Camera, T: FloatArray) -> float:
+    def _board_equations(
+        self, by_shared: FloatArray, by_pose: FloatArray, by_point: FloatArray, weight: FloatArray, error: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of the board's points: information (3 P, 3 P), that shared with all other unknowns, and gradient (3 P,)."""
+        points, views = len(self.described), len(self._lengths)
+        weighted = (by_point * weight[..., None]).swapaxes(1, 2)
+        blocks, slopes = np.zeros((points, 3, 3)), np.zeros((points, 3, 1))
+        by_lens, by_poses = np.zeros((points, 3, by_shared.shape[2])), np.zeros((points * views, 3, 6))
+        np.add.at(blocks, self._point, weighted @ by_point)
+        np.add.at(slopes, self._point, weighted @ error[..., None])
+        np.add.at(by_lens, self._point, weighted @ by_shared)
+        np.add.at(by_poses, self._point * views + self._view, weighted @ by_pose)
+        own = np.zeros((points, 3, points, 3))
+        own[np.arange(points), :, np.arange(points)] = blocks
+        by_poses = by_poses.reshape(points, views, 3, 6).swapaxes(1, 2).reshape(points, 3, -1)
+        cross = np.concatenate([by_lens, by_poses], axis=2)
+        return own.reshape(3 * points, -1), cross.reshape(3 * points, -1), slopes.reshape(-1)
+
+    def _add_lens_prior(
+        self, information: FloatArray, gradient: FloatArray, state: FittedBoard, variance: float
+    ) -> None:
+        """Add the prior of the coefficients, relative to residuals of ``variance`` [px^2]."""
+        shared, prior = len(self._free), variance * self._prior[self._free]
+        information[range(shared), range(shared)] += prior
+        gradient[:shared] += prior * np.append(camera_parameters(state.camera), self._lacking)[self._free]
+
+    def _add_board_prior(
+        self, information: FloatArray, gradient: FloatArray, state: FittedBoard, variance: float
+    ) -> None:
+        """Add the prior of the board's points, relative to residuals of ``variance`` [px^2]."""
+        if not self._board_std:
+            return
+        prior, first = variance / self._board_std**2, len(gradient) - state.places.size
+        unknowns = range(first, len(gradient))
+        information[unknowns, unknowns] += prior
+        gradient[first:] += prior * (state.places - self.described).reshape(-1)
+
+    def _update_centroids(self, state: FittedBoard) -> float:
         """Update the centroids' offsets; returns the largest change [px]."""
         if self._radius == 0.0:
             return 0.0
-        outline = camera.project(se3.apply(T[self._view], self._points[:, None] + self._radius * _CIRCLE))
-        centre = camera.project(_in_camera(T[self._view], self._points))
+        T, points = state.T[self._view], state.places[self._point]
+        outline = state.camera.project(se3.apply(T, points[:, None] + self._radius * _CIRCLE))
+        centre = state.camera.project(self._in_camera(state))
         before = self._centroid
         self._centroid = np.nan_to_num(_area_centroid(outline) - centre)
         return float(np.abs(self._centroid - before).max())
+
+    def _in_camera(self, state: FittedBoard) -> FloatArray:
+        """Points (N, 3) of all views in the camera [m]."""
+        T = state.T[self._view]
+        return np.asarray(np.einsum('nij,nj->ni', T[:, :3, :3], state.places[self._point]) + T[:, :3, 3])
 
     def _by_view(self, rows: FloatArray) -> list[FloatArray]:
         """Rows (N, 2) of all points as those of each view."""
@@ -216,10 +302,6 @@ class LensFit:
 def _noise(error: FloatArray) -> float:
     """Standard deviation of a coordinate, from the median; at least a hundredth of a pixel."""
     return max(1.4826 * float(np.median(np.abs(error))), 0.01)
-
-
-def _in_camera(T: FloatArray, points: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum('nij,nj->ni', T[:, :3, :3], points) + T[:, :3, 3])
 
 
 def _area_centroid(outline: FloatArray) -> FloatArray:

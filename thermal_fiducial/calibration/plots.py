@@ -15,6 +15,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 import numpy as np
 
+from thermal_fiducial.calibration.board_shape import BoardShape
 from thermal_fiducial.calibration.lens_check import ImageError
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -42,7 +43,12 @@ def coverage(pixels: FloatArray, width: int, height: int) -> IntArray:
 
 
 def drawings(
-    size: tuple[int, int], pixels: FloatArray, residuals: Sequence[FloatArray], names: Sequence[str], error: ImageError
+    size: tuple[int, int],
+    pixels: FloatArray,
+    residuals: Sequence[FloatArray],
+    names: Sequence[str],
+    error: ImageError,
+    board: BoardShape,
 ) -> str:
     """All drawings as HTML.
 
@@ -52,6 +58,7 @@ def drawings(
     pixels : (N, 2) measured points of all views
     residuals : of each view (n, 2) [px], measured minus predicted
     names : of the views
+    board : as described, and as found
     """
     every = np.concatenate(residuals)
     with rc_context(_STYLE):
@@ -60,6 +67,7 @@ def drawings(
             _coverage(size, pixels),
             _known(size, error),
             _spread(every),
+            *([_shape(board)] if board.largest_m > 0.0 else []),
             _bars(names, residuals),
         ]
     return f'<div class="plots">{"".join(parts)}</div>'
@@ -144,6 +152,25 @@ def _spread(residuals: FloatArray) -> str:
     # Numbers of three digits run into each other where there are more.
     axes.locator_params(nbins=5)
     return _html(figure, 'residuals of all points')
+
+
+def _shape(board: BoardShape) -> str:
+    """Where the points of the board are off: arrows in its plane, colours across it."""
+    title = 'the board against its description'
+    figure, axes = _figure(title)
+    points, along, across = board.seen_from_the_front()
+    most = 1e3 * float(np.abs(across).max())
+    shown = axes.scatter(*points.T, c=1e3 * across, cmap='coolwarm', vmin=-most, vmax=most)
+    figure.colorbar(shown, ax=axes, label='towards the viewer [mm]', shrink=0.8)
+    # Arrows are a twentieth of the board long, at the most.
+    long = max(float(np.linalg.norm(along, axis=1).max()), 1e-9)
+    scale = 20.0 * long / float(np.ptp(points, axis=0).max())
+    arrows = axes.quiver(*points.T, *along.T, angles='xy', scale_units='xy', scale=scale, color=_INK, width=0.004)
+    axes.quiverkey(arrows, 0.95, -0.1, long, f'{1e3 * long:.2g} mm', labelpos='W')
+    axes.set(xlabel='[m]', ylabel='[m]', aspect='equal')
+    axes.margins(0.1)
+    axes.locator_params(nbins=5)
+    return _html(figure, title)
 
 
 def _bars(names: Sequence[str], residuals: Sequence[FloatArray]) -> str:

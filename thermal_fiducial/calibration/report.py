@@ -123,7 +123,8 @@ def _overview(calibration: Calibration, error: ImageError) -> str:
     return (
         f'<p><b>{escape(calibration.lens_name())}</b>, {camera.width} x {camera.height} px; {len(calibration.views)} '
         f'views used, {len(calibration.dropped)} dropped; re-projection rms {calibration.rms_px:.4f} px, of views that '
-        f'were not fitted {held_out:.4f} &plusmn; {sigma:.4f} px.</p><p>{error.sentence().capitalize()}.</p>'
+        f'were not fitted {held_out:.4f} &plusmn; {sigma:.4f} px.</p><p>{error.sentence().capitalize()}. '
+        f'{calibration.board.sentence().capitalize()}.</p>'
     )
 
 
@@ -148,7 +149,8 @@ def _drawings(calibration: Calibration, views: Sequence[BoardView], error: Image
     used = [views[index] for index in calibration.views.tolist()]
     pixels = np.concatenate([view.sighting.pixels for view in used])
     size = calibration.camera.width, calibration.camera.height
-    return drawings(size, pixels, calibration.residuals, [view.name for view in used], error)
+    names = [view.name for view in used]
+    return drawings(size, pixels, calibration.residuals, names, error, calibration.board)
 
 
 def _left_out(frames: Sequence[LeftOut]) -> str:
