@@ -5,13 +5,9 @@ import os
 
 import numpy as np
 import pytest
-from support.real_flights import april_board
+from support.real_flights import april_board, camera_against_imu
 
-from thermal_fiducial.calibration.camera_imu import calibrate_rolling_camera_imu
-from thermal_fiducial.calibration.preintegration import ImuTrack
-from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.measurements import corner_covariances, corners_px
 
 pytestmark = pytest.mark.skipif(not os.environ.get('THERMAL_FIDUCIAL_DATA'), reason='no real data at hand')
 
@@ -20,18 +16,7 @@ pytestmark = pytest.mark.skipif(not os.environ.get('THERMAL_FIDUCIAL_DATA'), rea
 def calibrated(camera, seconds, every):
     """Calibration of a camera from every so many frames of the first seconds, and T_body_camera as published."""
     flight = april_board(camera, seconds=seconds, every=every)
-    stamps = np.array([sample.stamp_ns for sample in flight.samples])
-    rate = np.array([sample.angular_velocity for sample in flight.samples])
-    force = np.array([sample.linear_acceleration for sample in flight.samples])
-    imu = ImuTrack((stamps - stamps[0]) * 1e-9, rate, force)
-    frames = []
-    for stamp, rows in sorted(flight.frames.items()):
-        markers = [flight.marker_map.markers[marker_id] for marker_id in rows['id'].tolist()]
-        T = np.stack([marker.T_map_marker for marker in markers])
-        sizes = np.array([marker.size for marker in markers])
-        frames.append(FrameCorners(stamp, corners_px(rows), corner_covariances(rows), T, sizes))
-    found = calibrate_rolling_camera_imu(frames, flight.camera, imu, int(stamps[0]), flight.imu_noise)
-    return found, flight.T_body_camera
+    return camera_against_imu(flight), flight.T_body_camera
 
 
 def difference(T, T_other):

@@ -18,7 +18,12 @@ import yaml
 from support import self_calibration
 from support.batch_map import adjust
 from support.corner_runs import CornerFlight
+from thermal_fiducial.calibration.camera_imu import calibrate_rolling_camera_imu
 from thermal_fiducial.calibration.joint_pose import solve_camera_pose
+from thermal_fiducial.calibration.lens_choice import choose_model
+from thermal_fiducial.calibration.preintegration import ImuTrack
+from thermal_fiducial.calibration.rolling import FrameCorners
+from thermal_fiducial.calibration.targets import MarkerBoard
 from thermal_fiducial.config import ImuNoise, MarkerMapperConfig
 from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
@@ -93,6 +98,31 @@ def april_board(camera='cam0', sigma_px=BOARD_SIGMA_PX, seconds=_BOARD_S, every=
         size,
         ImuNoise(**published, **_INSTABILITY),
     )
+
+
+def camera_against_imu(flight):
+    """What ``calibrate camera-imu`` finds from the corners and the map of a flight."""
+    stamps = np.array([sample.stamp_ns for sample in flight.samples])
+    rate = np.array([sample.angular_velocity for sample in flight.samples])
+    force = np.array([sample.linear_acceleration for sample in flight.samples])
+    imu = ImuTrack((stamps - stamps[0]) * 1e-9, rate, force)
+    frames = []
+    for stamp, rows in sorted(flight.frames.items()):
+        markers = [flight.marker_map.markers[marker_id] for marker_id in rows['id'].tolist()]
+        T = np.stack([marker.T_map_marker for marker in markers])
+        sizes = np.array([marker.size for marker in markers])
+        frames.append(FrameCorners(stamp, corners_px(rows), corner_covariances(rows), T, sizes))
+    return calibrate_rolling_camera_imu(frames, flight.camera, imu, int(stamps[0]), flight.imu_noise)
+
+
+def lens_and_board(flight, every, board_std=5e-4):
+    """What ``calibrate intrinsics`` finds from one in so many frames of a flight, and the map of the board as found."""
+    # No detector: the corners are there.
+    board = MarkerBoard(flight.marker_map, None)
+    views = [board.sighting(rows) for _, rows in sorted(flight.frames.items())[::every]]
+    lens = flight.camera
+    found, _ = choose_model(views, lens.width, lens.height, ['plumb_bob'], focal_px=460.0, board_std=board_std)
+    return found, board.as_found(found.board)
 
 
 def part(flight, begin, seconds) -> CornerFlight:

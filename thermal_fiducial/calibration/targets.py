@@ -1,15 +1,17 @@
 """Calibration boards and their detection in raw frames: chessboard, circle grid, marker board."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from thermal_fiducial.calibration.appearance import Disc, SquaresMeet
+from thermal_fiducial.calibration.board_shape import BoardShape
 from thermal_fiducial.calibration.keypoints import blobs, saddles, without_speckles
 from thermal_fiducial.calibration.placement import BoardNodes
 from thermal_fiducial.calibration.recognition import BoardNotFound, recognise
+from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.mapping.map_data import MarkerMap
@@ -200,6 +202,7 @@ class MarkerBoard:
     radius = 0.0
 
     def __init__(self, board: MarkerMap, detector: Detector) -> None:
+        self._board = board
         self._markers = {key: marker for key, marker in board.markers.items() if marker.trusted}
         if len(self._markers) < LEAST_MARKERS:
             raise InputError(f'a board of {number_of(len(self._markers), "marker")}: calibration needs two or more')
@@ -210,7 +213,19 @@ class MarkerBoard:
         """See :class:`Target`."""
         # Views are independent: stamps far apart keep the detector from predicting motion between them.
         self._stamp_ns += _APART_NS
-        rows = self._detector.detect(self._stamp_ns, counts, camera)
+        return self.sighting(self._detector.detect(self._stamp_ns, counts, camera))
+
+    def as_found(self, shape: BoardShape) -> MarkerMap:
+        """The map of the board with its markers moved to where their corners were found."""
+        moved = dict(self._board.markers)
+        for key, marker in self._markers.items():
+            corners = corners_in_map(marker.T_map_marker[None], np.array([marker.size]))[0]
+            places = np.stack([shape.found(corner) for corner in corners])
+            moved[key] = replace(marker, T_map_marker=se3.rigid_alignment(places, corners) @ marker.T_map_marker)
+        return replace(self._board, markers=moved)
+
+    def sighting(self, rows: Markers) -> Sighting:
+        """Markers of the board among those of a frame. Raises BoardNotFound where they are too few."""
         rows = rows[np.isin(rows['id'], list(self._markers))]
         if len(rows) < LEAST_MARKERS:
             raise BoardNotFound(f'{number_of(len(rows), "marker")} of the board, of which two are needed')

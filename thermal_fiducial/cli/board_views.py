@@ -1,10 +1,12 @@
 """Views of a calibration board in pictures or a bag: the usable ones, and the reasons against the others."""
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 import re
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,18 +15,20 @@ from thermal_fiducial.calibration.lens_choice import choose_model
 from thermal_fiducial.calibration.plots import coverage
 from thermal_fiducial.calibration.recognition import BoardNotFound
 from thermal_fiducial.calibration.report import BoardView, LeftOut
-from thermal_fiducial.calibration.sources import clean_frames, measured_points, pictures, RawFrame
-from thermal_fiducial.calibration.targets import settles_a_pose, Sighting, Target
+from thermal_fiducial.calibration.sources import clean_frames, measured_points, pictures, RawFrame, recorded_camera
+from thermal_fiducial.calibration.targets import MarkerBoard, settles_a_pose, Sighting, Target
 from thermal_fiducial.cli.progress import tracked
+from thermal_fiducial.cli.recorded_corners import recorded_rows
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.measurements import Markers
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.core.wording import listed, number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import read_gray
 
-# Least motion of the board since the last view kept of a bag, and largest motion until the next frame [px].
-_NEW_VIEW_PX, _STILL_PX = 12.0, 0.7
+# Least motion of the board since the last view kept of a bag [px].
+_NEW_VIEW_PX = 12.0
 # Most reasons, and most frames named of one, in the line that ends a calibration: what can be taken in at a glance.
 _MOST_REASONS, _MOST_NAMES = 5, 3
 
@@ -47,6 +51,15 @@ class BoardViews:
     size: tuple[int, int] = (0, 0)
     _shown: Counter[str] = field(default_factory=Counter)
 
+    def recognise(self, name: str, rows: Markers) -> Sighting | None:
+        """The board among the detected markers of a frame; None as by :meth:`find`."""
+        assert isinstance(self.target, MarkerBoard)
+        try:
+            return self.target.sighting(rows)
+        except BoardNotFound as reason:
+            self.leave(name, str(reason))
+            return None
+
     def find(self, frame: RawFrame, camera: Camera) -> Sighting | None:
         """The board in a frame; None if it is not found, and the reason is kept in ``unusable``."""
         height, width = frame.counts.shape
@@ -62,11 +75,11 @@ class BoardViews:
             self.leave(frame.name, str(reason), frame.counts)
             return None
 
-    def keep(self, frame: RawFrame, sighting: Sighting) -> None:
+    def keep(self, view: BoardView) -> None:
         """Keep a view, and print how much of the image the views cover."""
-        self.kept.append(BoardView(frame.name, sighting, frame.counts))
+        self.kept.append(view)
         cells = self.covered()
-        print(f'{frame.name}: {len(sighting.pixels)} points; {np.sum(cells > 0)} of {cells.size} cells covered')
+        print(f'{view.name}: {len(view.sighting.pixels)} points; {np.sum(cells > 0)} of {cells.size} cells covered')
 
     def leave(self, name: str, reason: str, counts: Counts | Gray | None = None) -> None:
         """Leave out a frame for a reason; of frames with alike reasons the report shows some."""
@@ -117,11 +130,13 @@ class BoardViews:
             except BoardNotFound:
                 continue
 
-    def solve(self, models: Sequence[str], focal_px: float) -> tuple[Calibration, dict[str, Calibration]]:
-        """The best calibration, and the best of each lens model."""
+    def solve(
+        self, models: Sequence[str], focal_px: float, board_std: float
+    ) -> tuple[Calibration, dict[str, Calibration]]:
+        """The best calibration, and the best of each lens model, by a board known to ``board_std`` [m]."""
         radius = 0.0 if self.target is None else self.target.radius
         sightings = [view.sighting for view in self.kept]
-        return choose_model(sightings, *self.size, models, radius=radius, focal_px=focal_px)
+        return choose_model(sightings, *self.size, models, radius=radius, focal_px=focal_px, board_std=board_std)
 
 
 def _kind(reason: str) -> str:
@@ -161,25 +176,47 @@ def _look_at_picture(path: Path, index: int, views: BoardViews, focal_px: float)
     frame = RawFrame(path.name, index * 10_000_000_000, counts)
     sighting = views.find(frame, _guess(frame, focal_px))
     if sighting is not None:
-        views.keep(frame, sighting)
+        views.keep(BoardView(frame.name, sighting, frame.counts))
 
 
-def look_at_bag(bag: BagReader, views: BoardViews, focal_px: float, most: int, every: int) -> None:
-    """Look in every n-th frame of a bag for the board, at rest and in a new place."""
-    pending: tuple[RawFrame, Sighting] | None = None
-    frames = tracked(clean_frames(bag), 'looking for the board', bag.message_count([bag.image_topic]))
+class BagFrame(NamedTuple):
+    """A frame of a bag, whose board is looked for when it is asked for."""
+
+    name: str
+    counts: Counts | Gray | None
+    find: Callable[[], Sighting | None]
+
+
+def images_of(bag: BagReader, views: BoardViews, focal_px: float) -> Iterator[BagFrame]:
+    """Frames of the images of a bag."""
+    for frame in tracked(clean_frames(bag), 'looking for the board', bag.message_count([bag.image_topic])):
+        yield BagFrame(frame.name, frame.counts, partial(views.find, frame, _guess(frame, focal_px)))
+
+
+def corners_of(bag: BagReader, views: BoardViews) -> Iterator[BagFrame]:
+    """Frames of a bag that has the corners of markers instead of images."""
+    camera = recorded_camera(bag)
+    views.size = camera.width, camera.height
+    for index, (_, rows) in enumerate(recorded_rows(bag)):
+        yield BagFrame(str(index), None, partial(views.recognise, str(index), rows))
+
+
+def look_at_bag(frames: Iterable[BagFrame], views: BoardViews, most: int, every: int, most_motion_px: float) -> None:
+    """Look in every n-th frame of a bag for the board, in a new place, and nearly at rest until the next frame."""
+    pending: BoardView | None = None
     for index, frame in enumerate(frames):
         if pending is None and index % every:
             continue
-        sighting = views.find(frame, _guess(frame, focal_px))
+        sighting = frame.find()
         if pending is not None and sighting is not None:
-            if _distance(pending[1], sighting) < _STILL_PX:
-                views.keep(*pending)
+            motion_px = _distance(pending.sighting, sighting)
+            if motion_px < most_motion_px:
+                views.keep(pending)
             else:
-                views.leave(pending[0].name, 'the board moves', pending[0].counts)
+                views.leave(pending.name, f'the board moves by {motion_px:.1f} px until the next frame', pending.counts)
         pending = None
         if sighting is not None and _is_new(sighting, views.kept):
-            pending = (frame, sighting)
+            pending = BoardView(frame.name, sighting, frame.counts)
         if len(views.kept) >= most:
             return
 

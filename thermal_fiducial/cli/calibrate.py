@@ -15,6 +15,7 @@ from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.cli.ranges import IMU_NOISE
+from thermal_fiducial.cli.recorded_corners import has_corners_only, recorded_rows
 from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite, warn
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
@@ -23,9 +24,8 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, Markers
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, MARKERS_TOPIC, parse_remaps
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, parse_remaps
 from thermal_fiducial.files.camera_info import load_camera
-from thermal_fiducial.files.images import stamp_to_ns
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
@@ -105,9 +105,9 @@ def _camera_imu(args: argparse.Namespace) -> int:
         camera = _camera_of(bag, args.calibration)
         imu, start_ns = imu_track(bag)
         detector = mapped_detector(marker_map, args.map.parent, args.plate_thickness)
-        if args.plate_thickness and _has_corners_only(bag):
+        if args.plate_thickness and has_corners_only(bag):
             raise InputError(f'--plate-thickness has no effect with {args.bag}, which has corners instead of images')
-        found = _recorded_rows(bag) if _has_corners_only(bag) else _detected_rows(bag, detector, camera)
+        found = recorded_rows(bag) if has_corners_only(bag) else _detected_rows(bag, detector, camera)
         seen = sorted(_mapped_corners(found, marker_map), key=lambda frame: frame.stamp_ns)
     if not seen:
         raise InputError(f'{args.bag}: no frame shows a marker of {args.map}, which are of {marker_map.dictionary}')
@@ -132,27 +132,12 @@ def _camera_of(bag: BagReader, calibration: Path | None) -> Camera:
     return camera
 
 
-def _has_corners_only(bag: BagReader) -> bool:
-    """Whether the bag has the corners of markers instead of images, as those of ``import`` do."""
-    return bag.image_topic not in bag.topics and MARKERS_TOPIC in bag.topics
-
-
 def _detected_rows(bag: BagReader, detector: MarkerDetector, camera: Camera) -> Iterator[tuple[int, Markers]]:
     """Stamps and detections of the frames of a bag."""
     for frame in tracked(clean_frames(bag), 'finding markers', bag.message_count([bag.image_topic])):
         with naming(bag.path):
             camera.require_size_of(frame.counts)
         yield frame.stamp_ns, detector.detect(frame.stamp_ns, frame.counts, camera)
-
-
-def _recorded_rows(bag: BagReader) -> Iterator[tuple[int, Markers]]:
-    """Stamps and detections that a bag holds."""
-    # Needs ROS, which the other calibrations do without.
-    from thermal_fiducial.ros.messages.clouds import markers
-
-    bag.require({MARKERS_TOPIC: 'sensor_msgs/msg/PointCloud2'})
-    for entry in bag.messages([MARKERS_TOPIC]):
-        yield stamp_to_ns(entry.message.header.stamp), markers(entry.message)
 
 
 def _mapped_corners(found: Iterable[tuple[int, Markers]], marker_map: MarkerMap) -> Iterator['FrameCorners']:

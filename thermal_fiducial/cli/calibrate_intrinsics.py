@@ -7,16 +7,33 @@ from pathlib import Path
 
 import numpy as np
 
+from thermal_fiducial.calibration.board_shape import BoardShape
 from thermal_fiducial.calibration.intrinsics import Calibration
 from thermal_fiducial.calibration.lens_check import image_error, ImageError
 from thermal_fiducial.calibration.lens_choice import CANDIDATES
 from thermal_fiducial.calibration.report import write_refusal, write_report
 from thermal_fiducial.calibration.sources import is_folder_of_pictures
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
-from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures, look_at_points
+from thermal_fiducial.cli.board_views import (
+    BoardViews,
+    corners_of,
+    images_of,
+    look_at_bag,
+    look_at_pictures,
+    look_at_points,
+)
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import Parser
-from thermal_fiducial.cli.ranges import BOARD_MM, BOARD_POINTS, FOCAL_PX, IMAGE_PX, MORE_POINTS
+from thermal_fiducial.cli.ranges import (
+    BOARD_MM,
+    BOARD_POINTS,
+    BOARD_STD_MM,
+    FOCAL_PX,
+    IMAGE_PX,
+    MORE_POINTS,
+    MOTION_PX,
+)
+from thermal_fiducial.cli.recorded_corners import has_corners_only
 from thermal_fiducial.cli.subcommands import (
     add_force,
     add_remap,
@@ -32,8 +49,8 @@ from thermal_fiducial.core.measurements import places_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import save_camera
-from thermal_fiducial.files.dictionary import dictionary_of_map, load_dictionary
-from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.dictionary import bring_from_map, dictionary_of_map, load_dictionary
+from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.plain_yaml import save_plain
 from thermal_fiducial.files.reading import naming
 
@@ -53,8 +70,8 @@ def add_arguments(parser: Parser) -> None:
         'source',
         type=Path,
         metavar='SOURCE',
-        help='folder of pictures (8 or 16 bit), a bag with thermal/image_raw, or a CSV file of measured points '
-        '(columns view, point, u, v [px], x, y [m]; with --size)',
+        help='folder of pictures (8 or 16 bit), a bag with thermal/image_raw (or markers, the corners of a marker '
+        'board), or a CSV file of measured points (columns view, point, u, v [px], x, y [m]; with --size)',
     )
     parser.add_argument('--out', type=file_to_write, default=Path('camera_info.yaml'), help='calibration to write')
     parser.add_argument(
@@ -68,26 +85,53 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument('--most-views', type=whole_number(1), default=80, help='stop looking for views after this many')
     parser.add_argument('--every', type=whole_number(1), default=5, help='look at every n-th frame of a bag')
     parser.add_argument(
+        '--most-motion',
+        type=MOTION_PX,
+        default=0.7,
+        metavar='PX',
+        help='most motion of the board from a view of a bag to the next frame [px]; more only where all rows of an '
+        'image are read at once',
+    )
+    parser.add_argument(
         '--size', type=IMAGE_PX, nargs=2, metavar=('WIDTH', 'HEIGHT'), help='size of the image, needed with a CSV file'
     )
     add_remap(parser)
     _add_board(parser.add_argument_group('board'))
     add_thickness(parser)
+    parser.add_argument(
+        '--board-out', type=file_to_write, metavar='MAP', help='map to write, of a marker board as it was found'
+    )
     _refuse_what_is_for_others(parser)
 
 
 def _refuse_what_is_for_others(parser: Parser) -> None:
     """Refuse options that the source, or the board, has no use for."""
     parser.refuse(
-        ['--target', *_OF_CIRCLES, '--grid', '--spacing', '--board', '--most-views', '--every', '--remap'],
+        [
+            '--target',
+            *_OF_CIRCLES,
+            '--grid',
+            '--spacing',
+            '--board',
+            '--board-out',
+            '--most-views',
+            '--every',
+            '--most-motion',
+            '--remap',
+        ],
         'with a CSV file of measured points',
         _has_points,
     )
     parser.refuse(['--size'], 'without a CSV file of measured points', lambda args: not _has_points(args))
-    parser.refuse(['--every', '--remap'], 'with a folder of pictures', lambda args: is_folder_of_pictures(args.source))
+    of_bags = ['--every', '--most-motion', '--remap']
+    parser.refuse(of_bags, 'with a folder of pictures', lambda args: is_folder_of_pictures(args.source))
     parser.refuse(_OF_CIRCLES, 'without --target circles', lambda args: not args.target.endswith('circles'))
     parser.refuse(['--grid', '--spacing'], 'with --target markers', lambda args: args.target == 'markers')
-    parser.refuse(['--board', '--plate-thickness'], 'without --target markers', lambda args: args.target != 'markers')
+    parser.refuse(
+        ['--board', '--board-out', '--plate-thickness'],
+        'without --target markers',
+        lambda args: args.target != 'markers',
+    )
 
 
 def _has_points(args: argparse.Namespace) -> bool:
@@ -127,6 +171,13 @@ def _add_board(group: argparse._ArgumentGroup) -> None:
     )
     group.add_argument('--diameter', type=BOARD_MM, default=20.0, metavar='MM', help='diameter of the circles')
     group.add_argument('--board', type=Path, metavar='MAP', help='marker map of a marker board')
+    group.add_argument(
+        '--board-std',
+        type=BOARD_STD_MM,
+        default=0.5,
+        metavar='MM',
+        help='standard deviation of each coordinate of its points, which are unknowns as well; 0: exact',
+    )
 
 
 def _intrinsics(args: argparse.Namespace) -> int:
@@ -135,7 +186,8 @@ def _intrinsics(args: argparse.Namespace) -> int:
     if unknown:
         raise InputError(f'--models are {", ".join(CANDIDATES)}, not {", ".join(sorted(unknown))}')
     page = args.report or args.out.with_suffix('.html')
-    refuse_to_overwrite([args.out, _covariance_file(args.out), page], args.force)
+    written = [args.out, _covariance_file(args.out), page, *filter(None, [args.board_out])]
+    refuse_to_overwrite(written, args.force)
     views = _views(args)
     try:
         result, fits = _solved(views, args, models)
@@ -146,10 +198,16 @@ def _intrinsics(args: argparse.Namespace) -> int:
     error = image_error(result.camera, result.covariance, [views.kept[k].sighting for k in result.views.tolist()])
     save_camera(args.out, result.camera)
     _save_covariance(args.out, result, error)
+    if args.board_out is not None:
+        assert isinstance(views.target, MarkerBoard)
+        found = views.target.as_found(result.board)
+        bring_from_map(found.dictionary, args.board.parent, args.board_out.parent)
+        save_map(args.board_out, found)
     write_report(page, result, views.kept, fits, error, views.unusable)
     _print_result(args.out, result, fits, views, error)
     _warn_of_focal_length(result)
     _warn_of_principal_point(result)
+    _warn_of_board(result.board, 1e-3 * args.board_std)
     return 0
 
 
@@ -159,11 +217,11 @@ def _solved(
     """The best calibration, and the best of each lens model. Raises InputError, which names the source."""
     views.require(args.source)
     with naming(args.source):
-        result, fits = views.solve(models, args.focal_px)
-        if isinstance(views.target, MarkerBoard):
+        result, fits = views.solve(models, args.focal_px, 1e-3 * args.board_std)
+        if isinstance(views.target, MarkerBoard) and any(view.counts is not None for view in views.kept):
             # The first search refined the corners without knowledge of the distortion.
             views.look_again(result.camera)
-            result, fits = views.solve(models, args.focal_px)
+            result, fits = views.solve(models, args.focal_px, 1e-3 * args.board_std)
         return result, fits
 
 
@@ -179,7 +237,9 @@ def _views(args: argparse.Namespace) -> BoardViews:
     if not args.source.exists():
         raise InputError(f'{args.source}: no such folder of pictures, bag or CSV file')
     with BagReader(args.source, parse_remaps(args.remap)) as bag:
-        look_at_bag(bag, views, args.focal_px, args.most_views, args.every)
+        by_corners = isinstance(views.target, MarkerBoard) and has_corners_only(bag)
+        frames = corners_of(bag, views) if by_corners else images_of(bag, views, args.focal_px)
+        look_at_bag(frames, views, args.most_views, args.every, args.most_motion)
     return views
 
 
@@ -265,6 +325,14 @@ def _warn_of_principal_point(result: Calibration) -> None:
         warn(f'{known}: {remedy}')
 
 
+def _warn_of_board(board: BoardShape, board_std: float) -> None:
+    """Warn of a board that is off by more than it is known to [m]."""
+    # Of three coordinates. As many times the standard deviation as no board of 20 points or more reaches by chance.
+    if board_std and board.rms_m > 1.5 * np.sqrt(3.0) * board_std:
+        wider = f'--board-std {1e3 * board.rms_m / np.sqrt(3.0):.1f}'
+        warn(f'{board.sentence()}, more than {1e3 * board_std:.2g} mm allow: measure it, or give {wider}')
+
+
 def _print_result(
     out: Path, result: Calibration, fits: dict[str, Calibration], views: BoardViews, error: ImageError
 ) -> None:
@@ -277,5 +345,6 @@ def _print_result(
         print(f'{name} = {value:.6g} +- {sigma:.2g}')
     dropped = ', '.join(views.kept[index].name for index in result.dropped) or 'none'
     print(error.sentence())
+    print(result.board.sentence())
     seen = f'{len(result.views)} views of {len(views.kept) + len(views.unusable)} frames, dropped by the fit: {dropped}'
     print(f'{out}: {result.lens_name()}, rms {result.rms_px:.4f} px, {seen}')

@@ -7,6 +7,10 @@ from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 LENGTH_MM = number(0.0, 10_000.0, 'mm')
 #: Length that a target must have, up to a wall.
 BOARD_MM = number(0.1, 10_000.0, 'mm')
+#: How well the points of a target are known, of which more leaves no shape of it.
+BOARD_STD_MM = number(0.0, 100.0, 'mm')
+#: Motion in the image from frame to frame, of which more shows another place.
+MOTION_PX = number(0.0, 100.0, 'px')
 #: Points, or circles, along a side of a target; and by how many a row may be longer.
 BOARD_POINTS, MORE_POINTS = whole_number(1, 100), whole_number(0, 100)
 #: Side of an image, and focal length of a lens, from a fish-eye on the smallest sensor to a telescope.

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+import re
 
 from builtin_interfaces.msg import Time
 import cv2
@@ -30,8 +31,10 @@ from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.board_views import BoardViews
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera, save_camera
@@ -198,6 +201,61 @@ def test_intrinsics_from_a_bag(tmp_path, capsys):
     assert capsys.readouterr().out.count('cells covered') >= 7
     # Seven views in place of forty.
     assert load_camera(out).K[0, 0] == pytest.approx(lens.focal[0], rel=3e-3)
+
+
+def recorded_views(lens, known, count, bent):
+    """A bag of the corners of markers in views from all around, each a frame, of a board with ``bent`` (P, 3) added."""
+    sizes = np.array([marker.size for marker in known])
+    corners = corners_in_map(np.stack([marker.T_map_marker for marker in known]), sizes)
+    # Boards have y down.
+    T_map_board = known[0].T_map_marker @ np.diag([1.0, -1.0, -1.0, 1.0])
+    points = se3.apply(se3.inverse(T_map_board), (corners + bent.reshape(corners.shape)).reshape(-1, 3))
+    camera, rng, recorded = Camera(lens.width, lens.height, lens.matrix), np.random.default_rng(2), Recording([])
+    ids = np.array([marker.id for marker in known])
+    sigma_px = 0.03
+    for view in range(count):
+        stamp = START_NS + view * 33_333_333
+        pixels = lens.project(se3.apply(random_view(lens, points, rng), points)) + rng.normal(
+            0.0, sigma_px, (len(points), 2)
+        )
+        covariances = np.tile(sigma_px**2 * np.eye(2), (*corners.shape[:2], 1, 1))
+        rows = rows_from_corners(ids, pixels.reshape(-1, 4, 2), covariances, sizes, camera)
+        cloud = MARKER_CLOUDS.message(rows, Header(stamp=Time(sec=stamp // 10**9, nanosec=stamp % 10**9)))
+        recorded.events += [
+            (stamp, CAMERA_INFO_TOPIC, camera_info(stamp, camera)),
+            (stamp, MARKERS_TOPIC, Raw('sensor_msgs/msg/PointCloud2', cloud)),
+        ]
+    return recorded
+
+
+def test_intrinsics_from_recorded_corners(tmp_path, capsys):
+    """Of a flight, before a wall that is not as its map says, and whose origin lies behind the camera."""
+    marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
+    known = list(load_map(marker_map).markers.values())
+    bent = 2e-3 * np.random.default_rng(1).standard_normal((16, 3))
+    bag, out = tmp_path / 'bag', tmp_path / 'camera.yaml'
+    recorded_views(SMALL, known, 40, bent).write(bag)
+    words = ['calibrate', 'intrinsics', str(bag), '--target', 'markers', '--board', str(marker_map), '--out', str(out)]
+    words += ['--every', '1', '--models', 'plumb_bob']
+    # A flight is never at rest as a board is that is held still.
+    assert main(words) == 2
+    assert re.search(r'the board moves by \d+\.\d px until the next frame', capsys.readouterr().err)
+    found = tmp_path / 'found.yaml'
+    assert main([*words, '--most-motion', '100', '--board-out', str(found)]) == 0
+    printed = capsys.readouterr()
+    # Three coordinates of 2 mm each; the tolerance is three standard deviations by chance of 48 of them.
+    rms_mm = float(re.search(r'the points of the board are ([\d.]+) mm', printed.out)[1])
+    assert rms_mm == pytest.approx(2.0 * np.sqrt(3.0), rel=0.3)
+    assert 'more than 0.5 mm allow: measure it, or give --board-std' in printed.err
+    known_to = yaml.safe_load(out.with_name('camera_covariance.yaml').read_text())['sigma'][0]
+    assert abs(load_camera(out).K[0, 0] - SMALL.focal[0]) < 3.0 * known_to
+    # Forty views of sixteen points; as exact as that 2 mm leave 0.5 %.
+    assert known_to < 2e-3 * SMALL.focal[0]
+    # A square moves by the mean of its corners, half of 2 mm. Found to less than half of that.
+    moved = np.array([load_map(found).markers[one.id].T_map_marker[:3, 3] for one in known])
+    truth = np.array([one.T_map_marker[:3, 3] for one in known]) + bent.reshape(4, 4, 3).mean(axis=1)
+    left = se3.apply(se3.rigid_alignment(truth, moved), moved) - truth
+    assert np.sqrt(np.mean(left**2)) < 0.5e-3
 
 
 def test_a_board_of_plates_has_their_thickness(tmp_path, monkeypatch):

@@ -139,7 +139,7 @@ def test_command_calibrates_a_folder(tmp_path, capsys):
     assert seen.count('<figure>') == 8
     assert seen.count('<circle') == seen.count('<path') >= 8 * 24
     # Drawings stand side by side, none in another, in the colour of the page's text: dark pages are read too.
-    assert drawn.count('<svg') == drawn.count('<figure') == 5
+    assert drawn.count('<svg') == drawn.count('<figure') == 6
     assert 'currentColor' in drawn
     assert not re.search(r'fill: (black|#000000)', drawn)
     # The length of the arrows is written below them, clear of the title.
