@@ -120,7 +120,7 @@ MECHANISMS = {
     ),
     'joint draws of the map': Mechanism(
         ('bent corridor', 'wall', 'uneven map'),
-        ('error_sources:ErrorSources._lasting', 'normal_equations:BorderedSystem.drawn'),
+        ('error_sources:ErrorSources._lasting', 'normal_equations:ReducedSystem.drawn'),
         {'joint_fit:drawn_sum': _independent},
     ),
     'priors': Mechanism(

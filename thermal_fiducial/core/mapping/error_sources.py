@@ -21,7 +21,7 @@ from thermal_fiducial.core.error_model import (
 )
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem
-from thermal_fiducial.core.mapping.normal_equations import BorderedSystem, Vectors
+from thermal_fiducial.core.mapping.normal_equations import ReducedSystem, Vectors
 from thermal_fiducial.core.types import FloatArray, IntArray
 
 
@@ -40,7 +40,7 @@ class ErrorSources:
     """Errors of the M markers of an adjustment by those of what it was made from."""
 
     problem: MapProblem
-    system: BorderedSystem
+    system: ReducedSystem
     now: Linearised
     #: (n,) robust weights of the views
     weights: FloatArray

@@ -60,7 +60,7 @@ class NormalEquations:
         self._frames = int(self._frame[-1]) + 1
         self._starts = np.searchsorted(self._frame, np.arange(self._frames + 1))
 
-    def reduced(self, blocks: Blocks, damping: float = 0.0) -> 'BorderedSystem | None':
+    def reduced(self, blocks: Blocks, damping: float = 0.0) -> 'ReducedSystem | None':
         """The system of the nodes alone, factorised; None where it is singular."""
         try:
             root = np.linalg.inv(np.linalg.cholesky(_damped(blocks.frame, damping)))
@@ -71,7 +71,7 @@ class NormalEquations:
             free = np.flatnonzero(np.repeat(~self._held, 6))
             own = matrix[free][:, free]
             factor = _DenseFactor.of(own) if dense else _SparseFactor.of(own)
-            return BorderedSystem.of(ReducedSystem(root, coupling, matrix, factor, self._held), blocks.common)
+            return ReducedSystem(root, coupling, matrix, factor, self._held, blocks.common)
         except (RuntimeError, ValueError, np.linalg.LinAlgError):
             return None
 
@@ -187,95 +187,86 @@ class _SparseFactor:
         return np.asarray(0.5 * (result + np.swapaxes(result, -1, -2)))
 
 
-@dataclass(frozen=True)
 class ReducedSystem:
-    """Schur complement: the system of the nodes after the keyframes are eliminated."""
+    """Schur complement: the system of the nodes after the keyframes are eliminated.
 
-    #: (F, 6, 6) inverse Cholesky factors of the keyframes' blocks
-    root: FloatArray
-    #: these factors times the cross blocks of keyframes and nodes
-    coupling: Coupling
-    #: (6 M, 6 M) Schur complement, sparse in large maps, and its part of the free nodes
-    matrix: Any
-    factor: _DenseFactor | _SparseFactor
-    #: (M,)
-    held: BoolArray
+    Unknowns that all views have in common are eliminated last.
 
-    def solve(self, of_frames: FloatArray, of_nodes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Solutions (F, 6, K) and (M, 6, K) for right sides of the same shapes."""
-        count = of_frames.shape[-1]
-        sides = (self.root @ of_frames).reshape(-1, count)
-        remaining = self.coupling.taken_off(of_nodes.reshape(-1, count), sides).reshape(of_nodes.shape)
-        nodes = self._of_free(self.factor.solve(remaining[~self.held].reshape(-1, count)))
-        left = sides - self.coupling.times(nodes.reshape(-1, count))
-        return np.swapaxes(self.root, -1, -2) @ left.reshape(of_frames.shape), nodes
+    Parameters
+    ----------
+    root : (F, 6, 6) inverse Cholesky factors of the keyframes' blocks
+    coupling : these factors times the cross blocks of keyframes and nodes
+    matrix, factor : (6 M, 6 M) Schur complement, sparse in large maps, and its part of the free nodes, factorised
+    held : (M,)
+    common : terms of the common unknowns with keyframes, nodes and each other
 
-    def covariances(self) -> FloatArray:
-        """Covariances (M, 6, 6) of the nodes by noise."""
-        result = np.zeros((len(self.held), 6, 6))
-        result[~self.held] = self.factor.covariances()
-        return result
+    Raises
+    ------
+    LinAlgError
+        The whole is not positive definite.
+    """
 
-    def drawn(self, rng: np.random.Generator, count: int) -> FloatArray:
-        """``count`` draws (M, 6, K) of the nodes' errors by noise."""
-        return self._of_free(self.factor.drawn(rng.standard_normal((6 * np.count_nonzero(~self.held), count))))
-
-    def by_held(self, drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Errors (F, 6, K) and (M, 6, K) of all by those of the held nodes, of ``drawn`` (M, 6, K)."""
-        free, result, count = ~self.held, np.where(self.held[:, None, None], drawn, 0.0), drawn.shape[-1]
-        if result.any():
-            moved = (self.matrix @ result.reshape(-1, count)).reshape(result.shape)
-            result[free] = -self.factor.solve(moved[free].reshape(-1, count)).reshape(result[free].shape)
-        frames = -self.coupling.times(result.reshape(-1, count)).reshape(-1, 6, count)
-        return np.swapaxes(self.root, -1, -2) @ frames, np.asarray(result)
-
-    def _of_free(self, values: FloatArray) -> FloatArray:
-        """Of all nodes (M, 6, K) by those (m, K) of the free ones."""
-        nodes = np.zeros((len(self.held), 6, values.shape[-1]))
-        nodes[~self.held] = values.reshape(-1, 6, values.shape[-1])
-        return nodes
-
-
-@dataclass(frozen=True)
-class BorderedSystem:
-    """A reduced system with unknowns that all views have in common, which are eliminated last."""
-
-    apart: ReducedSystem
-    #: their terms with keyframes, nodes and each other, and what a unit of each moves the others by
-    border: Vectors
-    moved: Vectors
-    #: (L, L) inverse of their Schur complement
-    covariance: FloatArray
-
-    @classmethod
-    def of(cls, apart: ReducedSystem, border: Vectors) -> 'BorderedSystem':
-        """LinAlgError if the whole is not positive definite."""
-        moved = Vectors(*apart.solve(border.frames, border.nodes), border.common)
-        schur = border.common - moved.dot(border)
-        root = np.linalg.inv(np.linalg.cholesky(0.5 * (schur + schur.T)))
-        return cls(apart, border, moved, root.T @ root)
+    def __init__(
+        self,
+        root: FloatArray,
+        coupling: Coupling,
+        matrix: Any,
+        factor: _DenseFactor | _SparseFactor,
+        held: BoolArray,
+        common: Vectors,
+    ) -> None:
+        self._root, self._coupling, self._matrix, self._factor, self._held = root, coupling, matrix, factor, held
+        self._common = common
+        #: what a unit of each common unknown moves the others by
+        self.moved = Vectors(*self._apart(common.frames, common.nodes), common.common)
+        schur = common.common - self.moved.dot(common)
+        inverse_root = np.linalg.inv(np.linalg.cholesky(0.5 * (schur + schur.T)))
+        #: (L, L) inverse of the Schur complement of the common unknowns
+        self.covariance = inverse_root.T @ inverse_root
 
     def solve(self, sides: Vectors) -> Vectors:
         """Solutions for right sides of the same shapes."""
-        return self._with_common(*self.apart.solve(sides.frames, sides.nodes), sides.common)
+        return self._with_common(*self._apart(sides.frames, sides.nodes), sides.common)
+
+    def covariances(self, of_common: FloatArray) -> FloatArray:
+        """Covariances (M, 6, 6) of the nodes by noise, with that (L, L) of what is common."""
+        result = np.zeros((len(self._held), 6, 6))
+        result[~self._held] = self._factor.covariances()
+        return np.asarray(result + self.moved.nodes @ of_common @ np.swapaxes(self.moved.nodes, -1, -2))
 
     def drawn(self, common: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Draws (M, 6, K) of the nodes' errors by noise, with those (L, K) of what is ``common``."""
-        return self.apart.drawn(rng, common.shape[-1]) - self.moved.nodes @ common
-
-    def covariances(self, of_common: FloatArray) -> FloatArray:
-        """Covariances (M, 6, 6) of the nodes, with that (L, L) of what is common."""
-        return self.apart.covariances() + self.moved.nodes @ of_common @ np.swapaxes(self.moved.nodes, -1, -2)
+        normal = rng.standard_normal((6 * np.count_nonzero(~self._held), common.shape[-1]))
+        return self._of_free(self._factor.drawn(normal)) - self.moved.nodes @ common
 
     def by_held(self, drawn: FloatArray) -> Vectors:
         """Errors of all by those of the held nodes, of ``drawn`` (M, 6, K)."""
-        return self._with_common(*self.apart.by_held(drawn), np.zeros((1, 1)))
+        free, nodes, count = ~self._held, np.where(self._held[:, None, None], drawn, 0.0), drawn.shape[-1]
+        if nodes.any():
+            moved = (self._matrix @ nodes.reshape(-1, count)).reshape(nodes.shape)
+            nodes[free] = -self._factor.solve(moved[free].reshape(-1, count)).reshape(nodes[free].shape)
+        frames = -self._coupling.times(nodes.reshape(-1, count)).reshape(-1, 6, count)
+        return self._with_common(np.swapaxes(self._root, -1, -2) @ frames, nodes, np.zeros((1, 1)))
+
+    def _apart(self, of_frames: FloatArray, of_nodes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Solutions (F, 6, K) and (M, 6, K) for right sides of the same shapes, if nothing were common."""
+        count = of_frames.shape[-1]
+        sides = (self._root @ of_frames).reshape(-1, count)
+        remaining = self._coupling.taken_off(of_nodes.reshape(-1, count), sides).reshape(of_nodes.shape)
+        nodes = self._of_free(self._factor.solve(remaining[~self._held].reshape(-1, count)))
+        left = sides - self._coupling.times(nodes.reshape(-1, count))
+        return np.swapaxes(self._root, -1, -2) @ left.reshape(of_frames.shape), nodes
 
     def _with_common(self, frames: FloatArray, nodes: FloatArray, side: FloatArray) -> Vectors:
         """Solutions by those (F, 6, K) and (M, 6, K) without common unknowns, and the right sides (L, K) of these."""
-        apart = Vectors(frames, nodes, side)
-        common = self.covariance @ (side - apart.dot(self.border))
+        common = self.covariance @ (side - Vectors(frames, nodes, side).dot(self._common))
         return Vectors(frames - self.moved.frames @ common, nodes - self.moved.nodes @ common, common)
+
+    def _of_free(self, values: FloatArray) -> FloatArray:
+        """Of all nodes (M, 6, K) by those (m, K) of the free ones."""
+        nodes = np.zeros((len(self._held), 6, values.shape[-1]))
+        nodes[~self._held] = values.reshape(-1, 6, values.shape[-1])
+        return nodes
 
 
 def _damped(H: FloatArray, damping: float) -> FloatArray:

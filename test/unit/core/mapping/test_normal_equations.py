@@ -1,5 +1,7 @@
 """Schur complement, solutions and covariances of a bundle adjustment, against its system in one piece."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -102,7 +104,8 @@ def test_draws_have_the_covariance_of_the_free_markers():
     free = slice(6 * FRAMES, len(apart))
     expected = np.linalg.inv(whole[np.ix_(apart, apart)])[free, free]
     # Draws are linear in independent variables: of each alone they are the columns of a root of the covariance.
-    root = equations.reduced(blocks).apart.factor.drawn(np.eye(len(expected)))
+    each = SimpleNamespace(standard_normal=lambda shape: np.eye(*shape))
+    root = equations.reduced(blocks).drawn(np.zeros((COMMON, len(expected))), each)[~held].reshape(expected.shape)
     np.testing.assert_allclose(root @ root.T, expected, rtol=1e-8, atol=1e-10)
 
 
