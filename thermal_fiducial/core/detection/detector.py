@@ -86,11 +86,11 @@ class MarkerDetector:
         stamp_ns = whole_ns(stamp_ns, 'image')
         camera.require_size_of(counts)
         config, known, history = self.config, self._known, self._history
-        prediction = predict_frame(stamp_ns, prior, history.track, config.time_offset_std)
-        guide = prediction.guide if config.guided and len(known.ids) else None
-        T_camera_map = None if prediction.guide is None else prediction.guide.T_camera_map
+        twist, by_odometry = predict_frame(stamp_ns, prior, history.track, config.time_offset_std)
+        guide = by_odometry if config.guided and len(known.ids) else None
+        T_camera_map = None if by_odometry is None else by_odometry.T_camera_map
         keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
-        frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)
+        frame = Frame.of(stamp_ns, counts, camera, twist, config, keep_columns=keep_columns)
         found, history = self._finder.find(frame, history, known, guide, config)
         refined, scale = refine(frame, found, history.track, history.gray_scale, self._decoder)
         refined = confirmed(frame, found, refined, self._decoder, config)

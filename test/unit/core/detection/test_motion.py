@@ -210,5 +210,5 @@ def test_motion_that_shows_no_markers_is_forgotten():
         tracker = tracker.after(frame * period_ns, twist, ExpectedMarkers.none())
     state = Odometry(8 * period_ns, np.eye(4), TWIST[:3], TWIST[3:], 1e-6 * np.eye(6), 1e-6 * np.eye(6))
     # The twist of which nothing is known pulls by its share of the variance.
-    heard = predict_frame(8 * period_ns, motion_prior(state), tracker, 0.03).twist
+    heard, _ = predict_frame(8 * period_ns, motion_prior(state), tracker, 0.03)
     np.testing.assert_allclose(heard.value, TWIST, atol=1e-5)

@@ -36,16 +36,16 @@ def predicted(prior, time_offset_std=0.03):
 
 @pytest.mark.parametrize('offset_s', [0.0, -0.060, 0.035])
 def test_odometry_is_read_at_the_frame_s_stamp_in_its_own_clock(offset_s):
-    found = predicted(motion_prior(*states(offset_s), clock_offset=offset_s))
-    np.testing.assert_allclose(found.guide.T_camera_map, np.eye(4), atol=1e-3)
-    np.testing.assert_allclose(found.twist.value[:3], VELOCITY, atol=0.02)
+    twist, guide = predicted(motion_prior(*states(offset_s), clock_offset=offset_s))
+    np.testing.assert_allclose(guide.T_camera_map, np.eye(4), atol=1e-3)
+    np.testing.assert_allclose(twist.value[:3], VELOCITY, atol=0.02)
 
 
 @pytest.mark.parametrize(('age_s', 'holds'), [(0.140, True), (0.160, False)])
 def test_odometry_that_is_late_gives_both_twist_and_pose_or_neither(age_s, holds):
     """The newest state is so old."""
-    found = predicted(motion_prior(*states(-0.010 - age_s), clock_offset=0.0))
-    assert (found.twist is not None) == (found.guide is not None) == holds
+    twist, guide = predicted(motion_prior(*states(-0.010 - age_s), clock_offset=0.0))
+    assert (twist is not None) == (guide is not None) == holds
 
 
 def test_slow_odometry_shows_an_acceleration():
@@ -64,7 +64,7 @@ def test_slow_odometry_shows_an_acceleration():
             )
             for age_ms, noise in zip(range(105, 5, -20), 0.02 * rng.standard_normal((5, 3)), strict=True)
         ]
-        twist = predicted(motion_prior(*heard)).twist
+        twist, _ = predicted(motion_prior(*heard))
         errors.append(twist.ago(0.010)[3:] + 0.010 * acceleration)
         claims.append(np.sqrt(np.diag(twist.covariance)[3:]))
     error, normalised = (np.sqrt(np.mean(np.square(e))) for e in (errors, np.divide(errors, claims)))
@@ -73,19 +73,20 @@ def test_slow_odometry_shows_an_acceleration():
     assert normalised < 1.0
 
 
-def position_std(prediction):
-    return np.sqrt(np.trace(prediction.guide.covariance[:3, :3]))
+def position_std(guide):
+    return np.sqrt(np.trace(guide.covariance[:3, :3]))
 
 
 def test_an_unknown_clock_offset_widens_the_predicted_motion_and_pose():
-    known, unknown = (predicted(motion_prior(*states(), clock_offset=offset)) for offset in (0.0, None))
+    sure, known = predicted(motion_prior(*states(), clock_offset=0.0))
+    unsure, unknown = predicted(motion_prior(*states(), clock_offset=None))
     # 30 ms of the offset at 2 m/s, and at 3 m/s^2; the acceleration itself is known to a few m/s^2.
     assert position_std(unknown) == pytest.approx(np.hypot(position_std(known), 0.06), rel=1e-6)
     # A clock that the rig's file says is known to a millisecond.
-    calibrated = predicted(motion_prior(*states(), clock_offset=None), time_offset_std=0.001)
+    _, calibrated = predicted(motion_prior(*states(), clock_offset=None), time_offset_std=0.001)
     assert position_std(calibrated) == pytest.approx(np.hypot(position_std(known), 0.002), rel=1e-6)
-    assert np.sqrt(known.twist.covariance[0, 0]) < 0.02
-    assert 0.08 < np.sqrt(unknown.twist.covariance[0, 0]) < 0.3
+    assert np.sqrt(sure.covariance[0, 0]) < 0.02
+    assert 0.08 < np.sqrt(unsure.covariance[0, 0]) < 0.3
 
 
 def test_a_velocity_that_the_filter_does_not_know_blurs_no_frame():
@@ -97,7 +98,7 @@ def test_a_velocity_that_the_filter_does_not_know_blurs_no_frame():
     def by(std, track):
         covariance = np.diag([std**2] * 3 + [1e-4] * 3)
         wrong = (replace(state, velocity_body=np.full(3, -4.0), twist_covariance=covariance) for state in states())
-        return predict_frame(STAMP_NS, motion_prior(*wrong), track, 0.03).twist
+        return predict_frame(STAMP_NS, motion_prior(*wrong), track, 0.03)[0]
 
     np.testing.assert_allclose(by(0.05, track).value[:3], -4.0)
     np.testing.assert_allclose(by(3.0, track).value, moving.value, atol=1e-9)
@@ -107,9 +108,11 @@ def test_a_velocity_that_the_filter_does_not_know_blurs_no_frame():
 
 
 def test_impossible_odometry_is_left_alone():
-    found = predicted(motion_prior(*(replace(state, angular_velocity_body=np.full(3, 1e3)) for state in states())))
-    assert found.twist is None
-    assert found.guide is None
+    twist, guide = predicted(
+        motion_prior(*(replace(state, angular_velocity_body=np.full(3, 1e3)) for state in states()))
+    )
+    assert twist is None
+    assert guide is None
 
 
 @pytest.mark.parametrize('offset_s', [pytest.param(0.0, marks=pytest.mark.nightly), 0.035])

@@ -175,27 +175,22 @@ class Guide:
     covariance: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class FramePrediction:
-    """Motion and pose of the camera at a frame, predicted before its image is used."""
-
-    #: of the camera; None: unknown
-    twist: Twist | None
-    #: by recent odometry; None without
-    guide: Guide | None
-
-
 def predict_frame(
     stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, time_offset_std: float
-) -> FramePrediction:
-    """Prediction of a frame at ``stamp_ns``, in the camera's clock, from odometry and the last frames' markers.
+) -> tuple[Twist | None, Guide | None]:
+    """Motion and pose of the camera at a frame, from odometry and the last frames' markers, before its image is used.
 
     Parameters
     ----------
+    stamp_ns : of the frame, in the camera's clock
     time_offset_std : standard deviation of the clock offset before the filter has estimated it [s]
+
+    Returns
+    -------
+    Its twist, None if that is unknown, and its pose by recent odometry, None without.
     """
     if prior is None:
-        return FramePrediction(track.predict(stamp_ns), None)
+        return track.predict(stamp_ns), None
     lag_ns = max(round(SECOND_NS * track.lag), _SHORTEST_LAG_NS)
     odometry_ns = stamp_ns + prior.offset_ns
     clock_std_s = 0.0 if prior.clock_is_known else time_offset_std
@@ -206,14 +201,14 @@ def predict_frame(
         states = [other]
     twist = track.predict(stamp_ns)
     if not states or abs(odometry_ns - states[-1].stamp_ns) >= _STALE_NS:
-        return FramePrediction(twist, None)
+        return twist, None
     by_odometry = twist_by_odometry(odometry_ns, states, twist_transfer(track.T_body_camera), track.lag, clock_std_s)
     # That of a filter which is lost says less than the markers of the last frames, or than nothing.
     if np.trace(by_odometry.covariance) < np.trace((twist or UNKNOWN_TWIST).covariance):
         twist = by_odometry
     if twist is None:
-        return FramePrediction(None, None)
+        return None, None
     nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns))
     dt = (odometry_ns - nearest.stamp_ns) / SECOND_NS
     pose = extrapolated(nearest, dt, stamp_ns, track.T_body_camera, clock_std_s).pose
-    return FramePrediction(twist, Guide(se3.inverse(pose.T_map_camera), pose.covariance))
+    return twist, Guide(se3.inverse(pose.T_map_camera), pose.covariance)
