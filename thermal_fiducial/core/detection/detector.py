@@ -94,8 +94,7 @@ class MarkerDetector:
         found, history = self._finder.find(frame, history, known, guide, config)
         refined, scale = refine(frame, found, history.track, history.gray_scale, self._decoder)
         refined = confirmed(frame, found, refined, self._decoder, config)
-        ids, corners = refined.ids, refined.corners
-        at = refined.places.at.at_pixels(corners.corners_px)
+        ids, corners, at = refined.ids, refined.corners, refined.places.at
         poses = self._poses(ids, corners.covariances, at, T_camera_map)
         if config.plate_thickness > 0.0:
             at = corners_of_faces(at, poses.T_camera_marker[:, 0], known.sizes[ids], config.plate_thickness)
