@@ -10,9 +10,8 @@ from support.scenes import motion_prior
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.finding.drifted import drifted_markers
+from thermal_fiducial.core.detection.finding.drifted import drifted_markers, halvings, MarkerTemplate, NOT_THERE
 from thermal_fiducial.core.detection.finding.quads import halved
-from thermal_fiducial.core.detection.finding.template_matching import halvings, MarkerTemplate, NOT_THERE
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
