@@ -126,6 +126,17 @@ def covariance_of_mount(position_std: float, orientation_std: float) -> FloatArr
     return np.diag(np.repeat([position_std, orientation_std], 3) ** 2)
 
 
+def at_most_claimed(of_map: FloatArray, covariance: FloatArray) -> FloatArray:
+    """The map's error ``of_map`` (6, 6), at most what the ``covariance`` (6, 6) of a pose contains along any axis."""
+    root = np.linalg.cholesky(covariance)
+    units = np.linalg.inv(root)
+    shares, axes = np.linalg.eigh(units @ of_map @ units.T)
+    if shares[-1] <= 1.0:
+        return of_map
+    along = root @ axes
+    return np.asarray((along * np.clip(shares, 0.0, 1.0)) @ along.T)
+
+
 # The map, from a joint adjustment.
 
 

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-import numpy as np
 
+from thermal_fiducial.core.error_model import at_most_claimed
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
 from thermal_fiducial.core.types import FloatArray
@@ -102,21 +102,8 @@ class MapCorrections:
         self._error = next(of_stamp, self._error)
         error = self._error
         if error is not None and abs(pose.stamp_ns - error.stamp_ns) <= LATEST_NS:
-            pose = replace(pose, map_covariance=_part_of(pose.covariance, error.covariance))
+            # It changes slowly: that of another pose is used where that of this one is missing.
+            pose = replace(pose, map_covariance=at_most_claimed(error.covariance, pose.covariance))
         for T_new_old in self._corrections.since(pose.stamp_ns):
             pose = in_moved_map(pose, T_new_old)
         return pose
-
-
-def _part_of(covariance: FloatArray, of_map: FloatArray) -> FloatArray:
-    """The map's error ``of_map`` (6, 6), at most what the ``covariance`` (6, 6) of a pose contains along any axis.
-
-    It changes slowly, so that of another pose is used where that of this one is missing.
-    """
-    root = np.linalg.cholesky(covariance)
-    units = np.linalg.inv(root)
-    shares, axes = np.linalg.eigh(units @ of_map @ units.T)
-    if shares[-1] <= 1.0:
-        return of_map
-    along = root @ axes
-    return np.asarray((along * np.clip(shares, 0.0, 1.0)) @ along.T)
