@@ -45,7 +45,7 @@ class SystematicErrors:
     marker_shape: float = 0.7
     #: The most likely size of ``corner_px`` [px], which is the root of a mean: by it a marker's residuals are unusual.
     #: Enters weights of markers.
-    likely_corner_px: float = 0.1
+    likely_corner_px: float = corner_px
     #: What an adjustment of the map has found of the aspect ratio's error, as a share of the declared one, and (K,)
     #: joint draws of what it leaves, None before any. Corners are corrected by it before they enter anything.
     aspect_found: float = 0.0
@@ -55,9 +55,9 @@ class SystematicErrors:
 #: Distance over which the error of the corners stays the same [share of the image's width]: a lens model is wrong by a
 #: smooth function. On the same board lengths of 0.1 to 0.25 fit, 0.5 leaves NEES 1.1, 1.0 leaves 1.25.
 CORNER_LENGTH = 0.25
-#: Corners [px] where one hypothesis is weighed against another. Enters the weights of views of new markers, the choice
-#: between two poses, and weights by the map.
-DECISION_PX = 0.1
+#: Corners [px] where one hypothesis is weighed against another: as a good calibration leaves them. Enters the weights
+#: of views of new markers, the choice between two poses, and weights by the map.
+DECISION_PX = SystematicErrors.corner_px
 #: 99.9 % quantile of chi square with eight degrees of freedom, of a view of a marker.
 CHI2_OF_VIEW = 26.1
 #: Errors of successive poses by two cameras last as long as the view, for seconds: this many count as one.
@@ -71,18 +71,12 @@ READOUT_AS_DECLARED, READOUT_STD = 5e-4, 0.015
 HIDDEN_OF_READOUT = 0.1
 #: Part of the re-projection error, by bent plates and corner bias, that is no sign of an inconsistent marker [px].
 INCONSISTENT_PX = 0.3
-
-
 #: Largest noise of corners by pixels [px]: markers of twice the noise of a pixel claim 0.35. What a marker claims
 #: beyond it in most views is by an object that covers a side, and the same in all views, also in those few in which the
 #: outline looks like a square. Enters the covariance of a joint adjustment (:func:`shape_of_corners`).
 WHITE_PX = 0.5
-
-
 #: Covariance of an unknown acceleration of robot and camera in a brisk flight: 3 m/s^2, 4 rad/s^2.
 UNKNOWN_ACCELERATION = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2
-
-
 #: Joint draws of the errors of a map: standard deviations by 64 are accurate to a tenth, those by the lens exact.
 DRAWS = 64
 #: Those of a marker whose place is known exactly.
@@ -306,12 +300,6 @@ def diagonal_blocks(matrices: FloatArray) -> FloatArray:
 def covariance_by_draws(draws: FloatArray) -> FloatArray:
     """Covariances (..., m, m) of draws (..., m, K) of errors whose mean is zero."""
     return np.asarray(draws @ np.swapaxes(draws, -1, -2) / draws.shape[-1])
-
-
-def nearest_semidefinite(covariances: FloatArray) -> FloatArray:
-    """The nearest positive semidefinite matrices (..., 6, 6)."""
-    root = covariance_root(covariances)
-    return np.asarray(root @ np.swapaxes(root, -1, -2))
 
 
 def covariance_root(covariances: FloatArray) -> FloatArray:

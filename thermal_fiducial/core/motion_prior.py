@@ -15,11 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import (
-    covariance_of_motion,
-    covariance_of_one_error,
-    nearest_semidefinite,
-)
+from thermal_fiducial.core.error_model import covariance_of_motion, covariance_of_one_error, covariance_root
 from thermal_fiducial.core.geometry.reprojection import lever_arm, turned
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import CameraPose, Odometry
@@ -163,9 +159,10 @@ def extrapolated(
 def displacement_covariance(first: CameraPose, predicted: PredictedCamera) -> FloatArray:
     """Covariance (6, 6) of the displacement by odometry since ``first``: the smaller of two bounds.
 
-    One is the difference of the covariances, as if the error grew by independent increments; the other the error of
-    the velocity, constant over that time.
+    One is the difference of the covariances, as if the error grew by independent increments, or what is nearest to it
+    of covariances; the other the error of the velocity, constant over that time.
     """
     seconds = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS
-    bounds = nearest_semidefinite(predicted.pose.covariance - first.covariance), predicted.velocity_covariance(seconds)
+    root = covariance_root(predicted.pose.covariance - first.covariance)
+    bounds = np.asarray(root @ root.T), predicted.velocity_covariance(seconds)
     return min(bounds, key=lambda covariance: float(np.trace(covariance)))
