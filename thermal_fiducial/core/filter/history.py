@@ -222,7 +222,7 @@ class History:
         if self.main and belief.main:
             self.main = self._carried(self.main, newest_ns)
             if newest_ns - belief.main.estimate.stamp_ns >= _KEPT_EVERY_NS:
-                other = self._at(belief.alternative, newest_ns)
+                other = belief.alternative and self._carried(belief.alternative, newest_ns)
                 self._beliefs.append(belief._replace(main=self.main, alternative=other))
         # Half of the buffer at a time: each removal moves the rest.
         if newest_ns - self.imu.oldest_ns > 2 * self._kept_ns:
@@ -357,18 +357,14 @@ class History:
         steps = self.imu.steps(estimate.stamp_ns, until_ns)
         return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self.walks))
 
-    def _at(self, other: Hypothesis | None, until_ns: int) -> Hypothesis | None:
-        """A hypothesis, if there is one, propagated to an instant that is not later than the newest sample."""
-        return other and self._carried(other, until_ns)
-
     def _forget_old(self) -> None:
         """Remove what is older than any pose that may still be inserted."""
         horizon_ns = self.imu.newest_ns - self._kept_ns
         if self.belief.stamp_ns < horizon_ns and self.belief.main is None:
             # Initialising, and no pose for that long: only the hypothesis carried to the earliest next one is needed.
-            belief = self.belief
-            second = self._at(belief.second, horizon_ns)
-            self._beliefs = [belief._replace(alternative=self._at(belief.alternative, horizon_ns), second=second)]
+            hypotheses = self.belief.alternative, self.belief.second
+            other, second = (hypothesis and self._carried(hypothesis, horizon_ns) for hypothesis in hypotheses)
+            self._beliefs = [self.belief._replace(alternative=other, second=second)]
         while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
             del self._beliefs[0]
         oldest = self._beliefs[0]

@@ -76,7 +76,7 @@ class BodyPose:
 
         Of turns that it does not show, the map's error stays that of the last one; the position follows such a turn.
         """
-        seen, turns = self.seen_from(T_map_body), self.covariance[:3, :3]
+        seen, turns = replace(self, T_map_body=T_map_body), self.covariance[:3, :3]
         if turns.trace() < _UNKNOWN_TURN**2:
             return seen
         variances, axes = np.linalg.eigh(turns)
@@ -87,10 +87,6 @@ class BodyPose:
         of_own = np.eye(6) - of_last
         of_map = of_own @ self.map_covariance @ of_own.T + of_last @ last.map_covariance @ of_last.T
         return replace(seen, map_covariance=of_map)
-
-    def seen_from(self, T_map_body: FloatArray) -> 'BodyPose':
-        """It with ``T_map_body`` of an estimate, which shows better than a noisy pose how the view changes."""
-        return replace(self, T_map_body=T_map_body)
 
     def correlation(self, last: 'BodyPose', angle: float) -> float:
         """Correlation, 0 to 1, of the systematic errors of this pose and of the ``last`` one.

@@ -193,8 +193,9 @@ def with_unknown_clock(config: PoseEkfConfig, covariance: FloatArray) -> FloatAr
 
 def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estimate:
     """The estimate with the systematic error of poses propagated to the view of ``pose``: first-order Markov."""
-    last = estimate.pose_noise.last
-    alike = pose.seen_from(estimate.state.T_map_body).correlation(last, config.systematic_angle)
+    # The estimate shows better than a noisy pose how the view changes.
+    seen = replace(pose, T_map_body=estimate.state.T_map_body)
+    alike = seen.correlation(estimate.pose_noise.last, config.systematic_angle)
     share = estimate.pose_noise.lasting
     of_view = share * config.systematic_pose_std**2 * pose.shape
     P = estimate.covariance.copy()
