@@ -127,24 +127,24 @@ def copied_beside(name: str, folder: Path) -> Path | None:
     return copy if is_own_file(name) and copy.resolve() != Path(name).resolve() else None
 
 
-def bring_beside(name: str, folder: Path) -> None:
+def bring_beside(name: str, folder: Path, *, anew: bool = False) -> None:
     """Copy a dictionary file into the ``folder`` of a map, which names it without a path; nothing for a known name.
 
     Raises
     ------
     InputError
-        The file cannot be read or written, or another one has its place.
+        The file cannot be read or written, or another one has its place, unless the folder is made ``anew``.
     """
     copy = copied_beside(name, folder)
     if copy is None:
         return
     text = read_text(name)
-    if is_there(copy) and read_text(copy) != text:
+    if not anew and is_there(copy) and read_text(copy) != text:
         raise InputError(f'{copy}: not the dictionary {name}, which a map in its folder would look for there')
     write_text(copy, text)
 
 
-def bring_from_map(name: str, map_folder: Path, folder: Path) -> None:
+def bring_from_map(name: str, map_folder: Path, folder: Path, *, anew: bool = False) -> None:
     """Copy the dictionary file of a map in ``map_folder`` into the ``folder`` of one that is made from it.
 
     Nothing for a known name, or if the map has no such file beside it: it may be on the robot alone.
@@ -156,7 +156,7 @@ def bring_from_map(name: str, map_folder: Path, folder: Path) -> None:
     """
     own = map_folder / name
     if is_own_file(name) and name == own.name and is_there(own):
-        bring_beside(str(own), folder)
+        bring_beside(str(own), folder, anew=anew)
 
 
 def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: Dictionary, comment: str = '') -> None:

@@ -15,7 +15,7 @@ from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
-from thermal_fiducial.files.dictionary import copied_beside
+from thermal_fiducial.files.dictionary import bring_beside, bring_from_map
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.reading import is_text, shown
 from thermal_fiducial.files.writing import into, write_text
@@ -227,31 +227,17 @@ def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[
             warn('no map (--map): without one marker of known pose there is nothing to find the camera from')
         return arguments
     if Path(given).resolve() != run_map.resolve():
-        _copy_map(Path(given), run_map, settings.map_dictionary)
+        with into(run_map):
+            shutil.copyfile(given, run_map)
+        bring_from_map(settings.map_dictionary, Path(given).parent, options.run, anew=True)
     return [*arguments, '-p', f'map_file:={json.dumps(str(run_map))}']
-
-
-def _copy_map(given: Path, run_map: Path, dictionary: str) -> None:
-    """Copy a map, and the file of its ``dictionary``, which each map has beside itself."""
-    with into(run_map):
-        shutil.copyfile(given, run_map)
-    own = given.parent / dictionary
-    if dictionary == own.name:
-        _copy_dictionary(own, run_map.parent)
-
-
-def _copy_dictionary(own: Path, folder: Path) -> None:
-    copy = copied_beside(str(own), folder)
-    if copy is not None and own.is_file():
-        with into(copy):
-            shutil.copyfile(own, copy)
 
 
 def _final_map(path: Path, config: MarkerMapperConfig) -> MarkerMap:
     """The final map; writes its file if no node has saved it, and completes marker sizes that the file leaves out."""
     if not path.exists():
         marker_map = MarkerMap(frame_id=config.map_frame, dictionary=Path(config.dictionary).name)
-        _copy_dictionary(Path(config.dictionary), path.parent)
+        bring_beside(config.dictionary, path.parent, anew=True)
     else:
         marker_map = load_map(path, config.marker_size, size_overrides(config.marker_size_overrides))
         if config.mode == 'mapping':

@@ -8,7 +8,7 @@ import yaml
 
 from thermal_fiducial.core.detection.patterns import correctable_bits
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.dictionary import load_dictionary, other_patterns, save_dictionary
+from thermal_fiducial.files.dictionary import bring_from_map, load_dictionary, other_patterns, save_dictionary
 
 NAMES = ['DICT_4X4_50', 'DICT_5X5_1000', 'DICT_6X6_250', 'DICT_7X7_50', 'DICT_APRILTAG_36h11', 'DICT_APRILTAG_16h5']
 
@@ -101,3 +101,16 @@ def test_a_map_names_a_dictionary_or_a_file_beside_it_and_opens_no_other(tmp_pat
         assert 'not opened' in other_patterns([3], path, 'DICT_4X4_50', beside)
     # The parameter is the user's own: it may be any path, and the map that is written says so.
     assert other_patterns([3], '/elsewhere/own.yaml', str(tmp_path / 'own.yaml'), beside) == ''
+
+
+def test_a_run_that_is_made_anew_gets_the_dictionary_file_that_its_map_has_now(tmp_path):
+    maps, run = tmp_path / 'maps', tmp_path / 'run'
+    maps.mkdir()
+    run.mkdir()
+    for name in ('DICT_4X4_50', 'DICT_5X5_50'):
+        save_dictionary(maps / 'own.yaml', 'own', load_dictionary(name))
+        bring_from_map('own.yaml', maps, run, anew=True)
+        assert (run / 'own.yaml').read_text() == (maps / 'own.yaml').read_text()
+    save_dictionary(maps / 'own.yaml', 'own', load_dictionary('DICT_6X6_50'))
+    with pytest.raises(InputError, match='not the dictionary'):
+        bring_from_map('own.yaml', maps, run)
