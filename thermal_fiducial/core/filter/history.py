@@ -124,7 +124,7 @@ class History:
         offset = hypothesis.estimate.state.time_offset if hypothesis else first_offset
         return pose.stamp_ns + self._offset_ns + round(offset * SECOND_NS)
 
-    def untimely(self, pose: CameraPose, instead_of: Collection[int] = ()) -> str:
+    def untimely(self, pose: CameraPose, instead_of: Collection[int]) -> str:
         """Why a pose with this stamp cannot be inserted; empty if it can. It replaces poses with the stamps given."""
         if not self.imu:
             return 'refused: no IMU yet'

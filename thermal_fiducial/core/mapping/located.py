@@ -191,9 +191,10 @@ class LocatedFrame:
 
     stamp_ns: int
     camera: Camera
-    #: all N markers as detected, and without what is known of the lens's error; which (N,) are in the map, and these
+    #: all N markers, without what an undeclared readout displaces them by, and also without the known error of the lens
     raw: Observations
     observed: Observations
+    #: which (N,) are in the map, and these
     is_known: BoolArray
     known: Sight
     #: the camera pose by odometry
