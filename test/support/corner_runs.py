@@ -181,7 +181,7 @@ class _Chain:
         self._second = _Chain(flight, self.mapper.map, 'localization', {})
         mounts = covariance_of_mount(self.config.extrinsics_position_std, self.config.extrinsics_orientation_std)
         places = self.flight.T_body_camera, flight.T_body_camera
-        self._pair = SecondCamera(*places, mounts, self.config.time_offset_std)
+        self._pair = SecondCamera(*places, mounts, self.config.time_offset_std, 0.0)
 
     def add_second_frame(self, stamp_ns) -> None:
         flight, mapper = self._second.flight, self._second.mapper

@@ -31,8 +31,6 @@ _LATE_NS = 87_000_000
 _DOUBT = 2.0
 # Ratio of determinants below which one pose is better than both together: two that are as good are averaged.
 _CLEARLY = 0.999
-# Covariance of a mount that is exact.
-_EXACT: FloatArray = np.zeros((6, 6))
 
 
 class SecondClock:
@@ -87,9 +85,9 @@ class SecondCamera:
         self,
         T_body_first: FloatArray,
         T_body_second: FloatArray,
-        mount_covariance: FloatArray = _EXACT,
-        time_offset_std: float = 0.0,
-        time_offset_random_walk: float = 0.0,
+        mount_covariance: FloatArray,
+        time_offset_std: float,
+        time_offset_random_walk: float,
     ) -> None:
         self._T_body_first = T_body_first
         self._T_second_first = inverse(T_body_second) @ T_body_first

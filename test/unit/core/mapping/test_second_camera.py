@@ -31,6 +31,8 @@ MS = 1_000_000
 T_BODY_FIRST = small_bag.T_BODY_CAMERA
 #: Beside the first, turned by half a radian.
 T_BODY_SECOND = T_BODY_FIRST @ transform(so3_exp([0.0, 0.5, 0.0]), [0.2, 0.0, 0.0])
+#: Covariance of a mount.
+EXACT = np.zeros((6, 6))
 
 
 def pose(stamp_ns, T, variances=(1e-4,) * 6):
@@ -39,6 +41,10 @@ def pose(stamp_ns, T, variances=(1e-4,) * 6):
 
 def second_pose(stamp_ns, T_map_body, variances=(1e-4,) * 6):
     return pose(stamp_ns, T_map_body @ T_BODY_SECOND, variances)
+
+
+def pair(mounts=EXACT, time_offset_std=0.0):
+    return SecondCamera(T_BODY_FIRST, T_BODY_SECOND, mounts, time_offset_std, 0.0)
 
 
 def flying(speed):
@@ -52,14 +58,14 @@ def flying(speed):
 
 
 def test_an_exact_pose_of_the_second_is_one_of_the_first():
-    cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND)
+    cameras = pair()
     alone = cameras.add_second(second_pose(0, np.eye(4)), MotionPrior())
     np.testing.assert_allclose(alone.T_map_camera, T_BODY_FIRST, atol=1e-15)
     assert cameras.alone == 1
 
 
 def test_after_a_clock_that_was_set_back_the_second_stands_in_as_before():
-    cameras, prior = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), MotionPrior()
+    cameras, prior = pair(), MotionPrior()
     cameras.with_second(pose(1_000_000 * MS, T_BODY_FIRST), prior)
     stamps = [1000 * k * MS for k in (1001, 1002, 500, 501)]
     assert all(cameras.add_second(second_pose(stamp, np.eye(4)), prior) for stamp in stamps)
@@ -117,7 +123,7 @@ def test_the_map_s_share_of_a_joint_pose_is_a_part_of_its_covariance(seed, decad
 
 
 def test_poses_that_contradict_each_other_are_not_joined():
-    cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND)
+    cameras = pair()
     first = pose(100 * MS, T_BODY_FIRST)
     cameras.with_second(pose(0, T_BODY_FIRST), MotionPrior())
     cameras.add_second(second_pose(100 * MS, transform(np.eye(3), [0.5, 0.0, 0.0])), MotionPrior())
@@ -132,7 +138,7 @@ def test_mounts_that_are_off_as_declared_contradict_nothing_and_are_claimed():
     contradicted = 0
     for _ in range(300):
         off = [transform(so3_exp(stds[1] * rng.normal(size=3)), stds[0] * rng.normal(size=3)) for _ in range(2)]
-        cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND, mounts)
+        cameras = pair(mounts)
         # Where the cameras are; the parameters have their places without these errors.
         first, second = T_BODY_FIRST @ off[0], T_BODY_SECOND @ off[1]
         alone = cameras.add_second(pose(0, second, variances), MotionPrior())
@@ -150,7 +156,7 @@ def test_mounts_that_are_off_as_declared_contradict_nothing_and_are_claimed():
 @pytest.mark.parametrize('lead_ms', [0, 50, -10])
 def test_a_pose_of_another_instant_is_carried_by_the_odometry(lead_ms):
     """At 4 m/s, the second seen ``lead_ms`` before the first: 20 cm in 50 ms, to a micrometre."""
-    cameras, prior, stamp = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), flying(4.0), 100 * MS
+    cameras, prior, stamp = pair(), flying(4.0), 100 * MS
     cameras.with_second(pose(30 * MS, T_BODY_FIRST), prior)
     seen = stamp - lead_ms * MS
     cameras.add_second(second_pose(seen, transform(np.eye(3), [4e-9 * seen, 0.0, 0.0])), prior)
@@ -163,7 +169,7 @@ def test_a_pose_of_another_instant_is_carried_by_the_odometry(lead_ms):
 @pytest.mark.parametrize('middle_ms', [92, 88])
 def test_a_correction_of_the_filter_is_no_motion(middle_ms):
     """The odometry jumps by 5 cm between the instants of the two frames; nothing moves."""
-    cameras, prior = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), MotionPrior()
+    cameras, prior = pair(), MotionPrior()
     for k in range(41):
         T = transform(np.eye(3), [0.05 * (5 * k > middle_ms), 0.0, 0.0])
         prior.add(5 * MS * k, Odometry(5 * MS * k, T, np.zeros(3), np.zeros(3), 1e-6 * np.eye(6), 1e-6 * np.eye(6)))
@@ -175,7 +181,7 @@ def test_a_correction_of_the_filter_is_no_motion(middle_ms):
 
 def test_a_pose_that_is_carried_by_an_uncertain_velocity_claims_it():
     """A filter that has just begun: 1 m/s of doubt, 2 cm in 20 ms."""
-    cameras, prior = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), MotionPrior()
+    cameras, prior = pair(), MotionPrior()
     unsure = np.diag([1.0] * 3 + [1e-6] * 3)
     for k in range(41):
         prior.add(5 * MS * k, Odometry(5 * MS * k, np.eye(4), np.zeros(3), np.zeros(3), 1e-6 * np.eye(6), unsure))
@@ -188,7 +194,7 @@ def test_a_pose_that_is_carried_by_an_uncertain_velocity_claims_it():
 
 
 def test_each_pose_counts_once_and_an_old_one_not_at_all():
-    cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND)
+    cameras = pair()
     cameras.with_second(pose(0, T_BODY_FIRST), flying(0.0))
     cameras.add_second(second_pose(20 * MS, np.eye(4)), flying(0.0))
     for stamp in (33, 66):
@@ -203,7 +209,7 @@ def test_each_pose_counts_once_and_an_old_one_not_at_all():
 @pytest.mark.parametrize('lead', [0.05, 0.5, 0.95])
 def test_two_cameras_of_any_frame_rate_are_joined_and_never_take_turns(rate, lead):
     """The second's frames come a ``lead`` of a period before the first's: all but the first few have a partner."""
-    cameras, prior = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), MotionPrior()
+    cameras, prior = pair(), MotionPrior()
     cameras.with_second(pose(0, T_BODY_FIRST), prior)
     for k in range(1, 31):
         second_ns, first_ns = (round((k - ahead) / rate * 1e9) for ahead in (lead, 0.0))
@@ -244,7 +250,7 @@ def swings(cameras, behind_s, frames, rng):
 
 @pytest.mark.parametrize('behind_ms', [0, 20, -20, 50])
 def test_the_difference_of_the_clocks_is_learned_and_poses_of_the_second_alone_follow_it(behind_ms):
-    cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND, time_offset_std=0.03)
+    cameras = pair(time_offset_std=0.03)
     prior = swings(cameras, behind_ms / 1e3, 90, np.random.default_rng(4))
     error, std = cameras.clock.seconds - behind_ms / 1e3, np.sqrt(cameras.clock.variance)
     # 90 poses of 4 mm at 0.7 m/s that count as three.
@@ -265,7 +271,7 @@ def test_the_difference_of_the_clocks_is_learned_and_poses_of_the_second_alone_f
 
 def test_contradictions_make_the_clocks_uncertain_again():
     """A step of 60 ms of the second's clock is found."""
-    cameras, rng = SecondCamera(T_BODY_FIRST, T_BODY_SECOND, time_offset_std=0.03), np.random.default_rng(5)
+    cameras, rng = pair(time_offset_std=0.03), np.random.default_rng(5)
     swings(cameras, 0.0, 90, rng)
     swings(cameras, 0.06, 90, rng)
     assert cameras.contradicted > 0
