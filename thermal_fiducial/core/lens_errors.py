@@ -98,6 +98,13 @@ def of_aspect(corners: FloatArray, camera: Camera, errors: SystematicErrors) -> 
     return np.asarray(errors.aspect * camera.aspect_error * (corners - camera.principal_point))
 
 
+def without_found_aspect(corners: FloatArray, camera: Camera, errors: SystematicErrors) -> FloatArray:
+    """Corners (..., 2) [px] without what an adjustment of the map has found of the error of the aspect ratio."""
+    if not errors.aspect_found:
+        return corners
+    return np.asarray(corners - errors.aspect_found * of_aspect(corners, camera, errors))
+
+
 def _modes(places: FloatArray, size: int, length: float) -> FloatArray:
     """Values (..., I) at ``places`` (...) [px] of functions of one axis: the smooth error is a random sum of them."""
     nodes, to_modes = _nodes(size, length)

@@ -17,7 +17,7 @@ from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import camera_in_body
-from thermal_fiducial.core.lens_errors import of_aspect
+from thermal_fiducial.core.lens_errors import without_found_aspect
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, FoundAspect, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers
@@ -131,10 +131,7 @@ class MarkerMapper:
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
         raw = self.readout.corrected(Observations.of(markers), camera, predicted)
         errors = self._errors_of(camera)
-        observed = raw
-        if errors.aspect_found:
-            off_px = errors.aspect_found * of_aspect(raw.corners, camera, errors)
-            observed = replace(raw, corners=raw.corners - off_px)
+        observed = replace(raw, corners=without_found_aspect(raw.corners, camera, errors))
         # Step 2: known and new markers.
         is_known, known = self._in_map(observed)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
