@@ -328,17 +328,16 @@ class History:
                 derivative = estimate.state.derivative(self.imu.at(estimate.stamp_ns))
                 estimate = estimate.widened(embedded_core(derivative), std)
         motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)
-
-        def of(measured: CameraPose) -> Innovation:
-            by_body = body_pose(measured, estimate.state.T_body_camera, self.config.pose_noise_scale)
-            return innovation_of(self.config, estimate, by_body, motion)
-
+        on_robot, scale = estimate.state.T_body_camera, self.config.pose_noise_scale
         possible = possible_poses(pose)
-        nearer, *farther = sorted(map(of, possible), key=attrgetter('nis'))
+        bodies = [body_pose(measured, on_robot, scale) for measured in possible]
+        innovations = [innovation_of(self.config, estimate, body, motion) for body in bodies]
+        nearer, *farther = sorted(innovations, key=attrgetter('nis'))
         if farther and farther[0].nis - nearer.nis < DECISIVE:
             # The estimate does not show which of the two it is: then nothing is known of the turn between them.
             between = unknown_turn(screw_difference(possible[0].T_map_camera, pose.T_map_camera))
-            return of(replace(pose, covariance=pose.covariance + between))
+            unsure = body_pose(replace(pose, covariance=pose.covariance + between), on_robot, scale)
+            return innovation_of(self.config, estimate, unsure, motion)
         return nearer
 
     def _carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
