@@ -1,5 +1,7 @@
 """Blind search and decoding: what is found, and above all what is not."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -293,11 +295,11 @@ def test_large_markers_are_found_where_their_sides_are(cell, sign):
 
 def near(image, marker_id, corners):
     """A marker that is found near a prediction (4, 2) [px]; None if it is not."""
-    frame = frame_of(image)
+    frame = replace(frame_of(image), twist=UNKNOWN_TWIST)
     expected = ExpectedMarkers(
         np.array([marker_id]), frame.camera.normalise(corners)[None], np.ones((1, 4)), np.zeros(1)
     )
-    return near_prediction(frame, UNKNOWN_TWIST, expected, DECODER, ArucoDetectorConfig())
+    return near_prediction(frame, expected, DECODER, ArucoDetectorConfig())
 
 
 @pytest.mark.parametrize('off', [(0.8, 0.3), (-0.5, -0.9), (-0.9, -0.9)])

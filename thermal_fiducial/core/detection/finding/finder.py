@@ -112,7 +112,7 @@ class MarkerFinder:
         if frame.twist is None or not config.guided:
             found, complete, holds = FoundMarkers.none(), False, False
         else:
-            found, number, in_map = self._guided(frame, frame.twist, history, known, guide, config)
+            found, number, in_map = self._guided(frame, history, known, guide, config)
             complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
             enough = complete or (number > 0 and len(found.ids) >= _ENOUGH * number)
             holds = in_map is not None and enough
@@ -121,15 +121,14 @@ class MarkerFinder:
             return found, history
         scales = _next_scales(history, found, complete=complete)
         found = found.and_elsewhere(self._blind(frame, history, found, scales, known, in_map, config))
-        if not holds and in_map is not None and guide is not None and frame.twist is not None:
+        if not holds and in_map is not None and guide is not None:
             missing = in_map.only(~among(in_map.ids, found.ids))
-            found = found.and_elsewhere(self._drifted(frame, frame.twist, missing, guide, history, config))
+            found = found.and_elsewhere(self._drifted(frame, missing, guide, history, config))
         return found, replace(history, searched_ns=frame.stamp_ns, scales=scales)
 
     def _guided(
         self,
         frame: Frame,
-        twist: Twist,
         history: FrameHistory,
         known: KnownMarkers,
         guide: Guide | None,
@@ -139,12 +138,12 @@ class MarkerFinder:
 
         And the number of predictions, and those from the map, of markers that could not be followed.
         """
-        last = history.track.expected(frame.stamp_ns, twist)
+        last = history.track.expected(frame.stamp_ns, frame.twist)
         places = Places.of(ImagePoints.seen_at(last.x, frame.camera), last.depth)
         wanted: BoolArray = np.asarray(frame.camera.contains(places.at.px, CUT_OFF_PX).all(axis=1))
         if not wanted.all():
             last, places = last.only(wanted), places.only(wanted)
-        found, in_map = followed(frame, twist, last, places, self._decoder, config), None
+        found, in_map = followed(frame, last, places, self._decoder, config), None
         lost = ~among(last.ids, found.ids)
         if guide is not None:
             in_map = known.expected(guide.T_camera_map, frame.camera, config.min_side_px, without=found.ids)
@@ -152,7 +151,7 @@ class MarkerFinder:
         missing = last.only(lost) if in_map is None else in_map.joined(last.only(lost))
         number = len(found.ids) + len(missing.ids)
         if len(missing.ids):
-            found = found.and_elsewhere(near_prediction(frame, twist, missing, self._decoder, config))
+            found = found.and_elsewhere(near_prediction(frame, missing, self._decoder, config))
         return found, number, in_map
 
     def _blind(
@@ -187,7 +186,6 @@ class MarkerFinder:
     def _drifted(
         self,
         frame: Frame,
-        twist: Twist,
         missing: ExpectedMarkers,
         guide: Guide,
         history: FrameHistory,
@@ -201,7 +199,7 @@ class MarkerFinder:
         if len(tried) == 0:
             return FoundMarkers.none()
         missing, places = missing.only(tried), places.only(tried)
-        displaced = places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
+        displaced = places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
         shown, corners = drifted_markers(
             frame.image,
             missing.ids,
@@ -214,7 +212,7 @@ class MarkerFinder:
         )
         x = ImagePoints.at(corners - displaced, frame.camera).x
         again = replace(missing, x=x).only(shown)
-        return near_prediction(frame, twist, again, self._decoder, config) if shown.any() else FoundMarkers.none()
+        return near_prediction(frame, again, self._decoder, config) if shown.any() else FoundMarkers.none()
 
     def allowed(self, known: KnownMarkers, config: ArucoDetectorConfig) -> BoolArray:
         """Which IDs of the dictionary may be found: of those that show a pose."""
@@ -242,7 +240,6 @@ def _next_scales(history: FrameHistory, found: FoundMarkers, *, complete: bool) 
 
 def followed(
     frame: Frame,
-    twist: Twist,
     last: ExpectedMarkers,
     places: Places,
     decoder: Decoder,
@@ -251,7 +248,7 @@ def followed(
     """Those of the ``last`` frame's N markers whose pattern the image shows at the predicted ``places``."""
     if len(last.ids) == 0:
         return FoundMarkers.none()
-    shown = places.at.px + places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
+    shown = places.at.px + places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
     likeness = decoder.likeness(frame.pixels, shown)
     similarity = likeness.correlation * np.sign(last.cnr)
     alike = (likeness.best == 4 * last.ids) & (similarity > _STILL_SIMILAR)
@@ -264,14 +261,13 @@ def followed(
 
 def near_prediction(
     frame: Frame,
-    twist: Twist,
     expected: ExpectedMarkers,
     decoder: Decoder,
     config: ArucoDetectorConfig,
 ) -> FoundMarkers:
     """Those of the ``expected`` markers that are decoded near their predictions."""
     places = Places.of(ImagePoints.seen_at(expected.x, frame.camera), expected.depth)
-    displaced = places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
+    displaced = places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
     ids = expected.ids
     shown = _shifted(frame.image, ids, places.at.px + displaced, decoder)
     shown = large_aligned(frame.image, shown, ids, decoder, predicted=True)

@@ -233,8 +233,6 @@ def layer_of(frame: Frame, window: FloatArray, factor: int = 1) -> Layer:
     blur = math.hypot(frame.blur_px / factor, math.sqrt((1.0 - 1.0 / factor**2) / 12.0))
 
     def displacement(points: FloatArray) -> FloatArray:
-        if frame.twist is None:
-            return np.zeros((len(points), 2))
         places = places_of_points(points, frame.camera)
         left = 1.0 if to_tails is None else REMAINING
         shift = left * places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)

@@ -175,8 +175,10 @@ class Places(Stacked):
         """Places of image points (N, 4) at ``depth`` (N, 4)."""
         return Places(at, depth, at.J @ interaction(at.x, depth))
 
-    def lag_blur(self, twist: Twist, lag: float) -> FloatArray:
-        """Mean displacement (N, 4, 2) [px] of the corners in a ``lag`` [s]."""
+    def lag_blur(self, twist: Twist | None, lag: float) -> FloatArray:
+        """Mean displacement (N, 4, 2) [px] of the corners in a ``lag`` [s]; none by an unknown twist."""
+        if twist is None:
+            return np.zeros_like(self.at.px)
         return np.asarray(-lag * (self.flow @ twist.ago(lag)))
 
 
@@ -287,9 +289,9 @@ class MotionBlur(Stacked):
 
 def motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlur:
     """Motion blur of all markers; lag tails are removed if the largest displacement by lag is not small."""
-    lag_blur = np.zeros_like(places.at.px) if twist is None else places.lag_blur(twist, frame.lag)
-    mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
-    if twist is None or (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
+    lag_blur, rolling = places.lag_blur(twist, frame.lag), rolling_displacement(places, twist, frame)
+    mean = lag_blur.mean(axis=1)
+    if (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
         return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean, lag_blur)
     shift = REMAINING * lag_blur + rolling
     to_tails = lag_tail_maps(places.at.px + shift, lag_blur)

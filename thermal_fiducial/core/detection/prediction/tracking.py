@@ -85,10 +85,10 @@ class MotionTrack:
             return None
         return Twist(self.twist.ago(-dt), self.twist.covariance + dt**2 * UNKNOWN_ACCELERATION, self.twist.acceleration)
 
-    def expected(self, stamp_ns: int, twist: Twist) -> ExpectedMarkers:
-        """The last frame's markers, predicted at this frame."""
+    def expected(self, stamp_ns: int, twist: Twist | None) -> ExpectedMarkers:
+        """The last frame's markers, predicted at this frame with its twist."""
         dt = self._since(stamp_ns)
-        if dt is None or self.twist is None or len(self.markers.ids) == 0:
+        if dt is None or twist is None or self.twist is None or len(self.markers.ids) == 0:
             return ExpectedMarkers.none()
         step = (0.5 * dt) * (twist.value + self.twist.value)
         moved = se3.inverse(se3.transform(se3.so3_exp(step[3:]), step[:3]))
