@@ -176,9 +176,9 @@ class _WeightedCorners(Stacked):
         for _ in range(_REFITS):
             bounds = _bounds(_mean_products(residuals, residuals), BIAS_OUTLIER * np.hypot(noise, bias_px))
             shares = by_noise * bounds
-            residuals = _refitted(fit.residuals, fit.J_camera, shares)
             if bounds.min() == 1.0:
                 break
+            residuals = _refitted(fit.residuals, fit.J_camera, shares)
         weights = shares[:, None, None]
         map_draws = weights * (fit.J_marker @ location.sight.draws)
         return _WeightedCorners(shares, noise, fit.residuals, fit.J_camera, weights * location.lens.modes, map_draws)
