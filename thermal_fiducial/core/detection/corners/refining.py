@@ -197,8 +197,6 @@ def _at_stamp(
     """Corners at the stamp, without lag and rolling shutter, by the twist that they correct."""
     at = places.at.at_pixels(refined.corners_px - blur.shift)
     deviation = np.sqrt(refined.mean_variance) / frame.camera.focal_px
-    # Corners that are inconsistent with a square get a larger covariance.
-    doubted = refined.covariances + refined.doubt[:, None, None, None] * _EYE
     # Without a predicted twist, the first round measures one between two lagging frames, and the second must not again:
     # its corners are corrected for lag, those of the last frame are not.
     twist = known
@@ -209,22 +207,21 @@ def _at_stamp(
             sure = refined.evident | ~refined.small | track.explains(frame.stamp_ns, frame.twist, measured)
             measured = measured.only(sure)
         twist = track.correct(frame.stamp_ns, frame.twist, measured)
-    if twist is None:
-        unsure = doubted + _of_unpredicted_motion(frame, places, refined, UNKNOWN_TWIST, cells)
-        return RefinedMarkers(
-            ids, refined, blur, replace(refined, covariances=unsure), Places(at, places.depth, places.flow), None
-        )
-    lag_blur = places.lag_blur(twist, frame.lag)
     rows = (refined.corners_px + blur.removed)[..., 1]
-    rolling = rolling_displacement(places, twist, frame, rows)
+    lag_blur, rolling = places.lag_blur(twist, frame.lag), rolling_displacement(places, twist, frame, rows)
     px = refined.corners_px - lag_blur + blur.removed - rolling
-    unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur, displayed=frame.displayed)
-    if frame.twist is None:
-        unknown = unknown + _of_unpredicted_motion(frame, places, refined, twist, cells)
-    elif frame.readout > 0.0:
-        # By a wrong twist rows are displaced the more, the farther they are from the middle one.
-        by_twist = delays(rows, frame)[..., None, None] * places.flow
-        unknown = unknown + by_twist @ twist.covariance @ by_twist.swapaxes(-1, -2)
+    # Corners that are inconsistent with a square get a larger covariance.
+    doubted = refined.covariances + refined.doubt[:, None, None, None] * _EYE
+    if twist is None:
+        unknown = _of_unpredicted_motion(frame, places, refined, UNKNOWN_TWIST, cells)
+    else:
+        unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur, displayed=frame.displayed)
+        if frame.twist is None:
+            unknown = unknown + _of_unpredicted_motion(frame, places, refined, twist, cells)
+        elif frame.readout > 0.0:
+            # By a wrong twist rows are displaced the more, the farther they are from the middle one.
+            by_twist = delays(rows, frame)[..., None, None] * places.flow
+            unknown = unknown + by_twist @ twist.covariance @ by_twist.swapaxes(-1, -2)
     corners = replace(refined, corners_px=px, covariances=doubted + unknown)
     return RefinedMarkers(ids, refined, blur, corners, Places(at.at_pixels(px), places.depth, places.flow), twist)
 
