@@ -6,7 +6,7 @@ import math
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.types import Counts, Float32Array, Gray, SIGMA_OF_MEDIAN
+from thermal_fiducial.core.types import Float32Array, Pixels, SIGMA_OF_MEDIAN
 
 # Columns among which one is compared with their mean.
 _COLUMNS = 9
@@ -16,7 +16,7 @@ _ROWS = 64
 _CLIPPED = 1.0 / math.erf(math.sqrt(0.5))
 
 
-def pixel_noise(counts: Counts | Gray | Float32Array) -> float:
+def pixel_noise(counts: Pixels) -> float:
     """Standard deviation of pixel noise [counts]: median absolute difference of vertical neighbours, sparsely.
 
     Differences along a column do not contain the column pattern. With whole counts and noise below half a count the

@@ -13,6 +13,8 @@ IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 Counts: TypeAlias = npt.NDArray[np.uint16]
 Gray: TypeAlias = npt.NDArray[np.uint8]
+#: (height, width) as received, or changed.
+Pixels: TypeAlias = Counts | Gray | Float32Array
 
 #: Nanoseconds of a second: stamps are whole nanoseconds, and seconds only differences of them.
 SECOND_NS = 1_000_000_000

@@ -13,7 +13,7 @@ import numpy as np
 
 from thermal_fiducial.core.detection.prediction.frame import without_tails
 from thermal_fiducial.core.geometry.reprojection import bilinear, seen_between
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray, Pixels, Stacked, TINY
 
 # Distance from a side at which black and white are compared [cells].
 _OUTSIDE = 0.4
@@ -169,17 +169,10 @@ class Decoder:
         return self._judged(match, steps)
 
     def likeness(
-        self,
-        image: Counts | Gray | Float32Array,
-        quads: FloatArray,
-        allowed: BoolArray | None = None,
-        lag_tails: FloatArray | None = None,
+        self, image: Pixels, quads: FloatArray, allowed: BoolArray | None = None, lag_tails: FloatArray | None = None
     ) -> PatternMatch:
         """Most similar patterns of quadrilaterals (Q, 4, 2), as :meth:`read`."""
-        counts = sampled(image, seen_between(quads, self._samples))
-        if lag_tails is not None:
-            counts = without_tails(counts, sampled(image, seen_between(lag_tails, self._samples)))
-        values = self._contrasts(counts)
+        values = self._values(image, quads, lag_tails)
         spread = np.sqrt((values * values).sum(axis=1, keepdims=True))
         similar = (values / np.maximum(spread, np.float32(TINY))) @ self._patterns.T
         if allowed is not None and not allowed.all():
@@ -238,18 +231,13 @@ class Decoder:
 
     def _steps(self, image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None) -> FloatArray:
         """Mean counts just outside the sides minus those just inside (Q, 4)."""
-        counts = sampled(image, seen_between(quads, self._beside_sides))
-        if lag_tails is not None:
-            counts = without_tails(counts, sampled(image, seen_between(lag_tails, self._beside_sides)))
+        counts = _counts_between(image, quads, lag_tails, self._beside_sides)
         means = counts.reshape(len(quads), 2, 4, -1).mean(axis=-1)
         return np.asarray(means[:, 0] - means[:, 1], dtype=np.float64)
 
-    def _values(self, image: Float32Array, quads: FloatArray) -> Float32Array:
-        """Mean counts (Q, m * m) of the cells of quadrilaterals (Q, 4, 2), without the background."""
-        return self._contrasts(sampled(image, seen_between(quads, self._samples)))
-
-    def _contrasts(self, counts: Float32Array) -> Float32Array:
-        """Mean counts (Q, m * m) of the cells without the background, by those of their samples (Q, P)."""
+    def _values(self, image: Pixels, quads: FloatArray, lag_tails: FloatArray | None = None) -> Float32Array:
+        """Mean counts (Q, m * m) of the cells of quadrilaterals (Q, 4, 2), without the background, as :meth:`read`."""
+        counts = _counts_between(image, quads, lag_tails, self._samples)
         # Small numbers for sums in single precision.
         return np.asarray((counts - counts[:, :1]) @ self._cells_of_samples)
 
@@ -275,7 +263,17 @@ def _in_plate(cells: int, margin: float) -> FloatArray:
     return bilinear(np.array([low, high, high, low]), np.array([low, low, high, high]))
 
 
-def sampled(image: Counts | Gray | Float32Array, places: Float32Array) -> Float32Array:
+def _counts_between(
+    image: Pixels, quads: FloatArray, lag_tails: FloatArray | None, weights: Float32Array
+) -> Float32Array:
+    """Counts (Q, P) at ``weights`` (4, P) of the corners of quadrilaterals (Q, 4, 2), without lag tails if given."""
+    counts = sampled(image, seen_between(quads, weights))
+    if lag_tails is None:
+        return counts
+    return without_tails(counts, sampled(image, seen_between(lag_tails, weights)))
+
+
+def sampled(image: Pixels, places: Float32Array) -> Float32Array:
     """Values (Q, P) of the image at columns and rows (2, Q, P)."""
     parts = [
         cv2.remap(image, part[0], part[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -32,7 +32,7 @@ from thermal_fiducial.core.detection.corners.warm_surface import ending_sides, f
 from thermal_fiducial.core.detection.prediction.frame import counts_of, MotionBlur
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import widths
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Pixels
 
 #: Columns of pixels per cell for clear markers, and for faint ones.
 OF_CLEAR, OF_FAINT = 6, 12
@@ -67,7 +67,7 @@ def too_blurred_for_sides(corners_px: FloatArray, cells: int, blur_px: float, mo
 
 
 def refine_corners(
-    image: Counts | Gray | Float32Array,
+    image: Pixels,
     corners: ImagePoints,
     camera: Camera,
     cells: int,

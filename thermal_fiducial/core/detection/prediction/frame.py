@@ -28,7 +28,7 @@ from thermal_fiducial.core.camera_frames import pixel_noise, with_columns_correc
 from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import interaction, Real
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Pixels, Stacked
 
 #: Least depth of points, used for those behind the camera [m].
 LEAST_DEPTH = 1e-3
@@ -69,7 +69,7 @@ class Frame:
 
     stamp_ns: int
     #: (height, width) as received where columns keep their fixed pattern, else counts without it
-    pixels: Counts | Gray | Float32Array
+    pixels: Pixels
     #: standard deviation of a pixel [counts]
     noise: float
     camera: Camera
@@ -205,7 +205,7 @@ def rolling_displacement(
     return np.asarray(later * (flow @ twist.value - (frame.lag - 0.5 * later) * (flow @ twist.acceleration)))
 
 
-def counts_of(pixel: IntArray, image: Counts | Gray | Float32Array, to_tails: FloatArray | None = None) -> Float32Array:
+def counts_of(pixel: IntArray, image: Pixels, to_tails: FloatArray | None = None) -> Float32Array:
     """Counts (M, C, 4 N, m) at the indices ``pixel`` of the flat image, lag tails removed; N markers in equal parts.
 
     Only these pixels are corrected, in a fourth of the time of the whole windows around the markers.
