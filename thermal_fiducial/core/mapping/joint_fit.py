@@ -210,11 +210,13 @@ class JointFit:
 
         None if the corners rule it out, or the markers would be smaller than a pixel from there.
         """
-        T = found.pose.T_map_camera
-        apart = (turn_between(T, hypotheses) > SAME_POSE) & self._shown_from(hypotheses)
         heavy = found.weights >= _HEAVY * found.weights.max()
         extent = np.ptp(self.sight.observed.corners[heavy], axis=(0, 1)) / self.camera.focal_px
-        if math.hypot(*extent) > WIDE or not np.any(apart):
+        if math.hypot(*extent) > WIDE:
+            return None
+        T = found.pose.T_map_camera
+        apart = (turn_between(T, hypotheses) > SAME_POSE) & self._shown_from(hypotheses)
+        if not np.any(apart):
             return None
         starts, weights = hypotheses[apart], found.weights * decision_weights(self.sight.noise_px)
         (T, other), chi2, _ = self.fit.solve(np.stack([T, starts[0]]), weights, inlier=np.inf)

@@ -229,6 +229,7 @@ class KeyframeStore:
     def _keyframe(
         self, observed: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None
     ) -> Keyframe:
+        """A frame to keep, after which all keyframes are in the pixels of its ``camera``."""
         if self._camera is not None and self.frames and not camera.matches(self._camera):
             self._carry_over(self._camera, camera)
         self._camera = camera
