@@ -144,11 +144,12 @@ class MarkerFinder:
         if not wanted.all():
             last, places = last.only(wanted), places.only(wanted)
         found, in_map = followed(frame, last, places, self._decoder, config), None
-        lost = ~among(last.ids, found.ids)
+        lost, missing = ~among(last.ids, found.ids), ExpectedMarkers.none()
         if guide is not None:
-            in_map = known.expected(guide.T_camera_map, frame.camera, config.min_side_px, without=found.ids)
+            missing = in_map = known.expected(guide.T_camera_map, frame.camera, config.min_side_px, without=found.ids)
             lost &= ~among(last.ids, known.ids)
-        missing = last.only(lost) if in_map is None else in_map.joined(last.only(lost))
+        if lost.any():
+            missing = missing.joined(last.only(lost))
         number = len(found.ids) + len(missing.ids)
         if len(missing.ids):
             found = found.and_elsewhere(near_prediction(frame, missing, self._decoder, config))
