@@ -5,7 +5,7 @@ image (J. Quinonero-Candela, C. Rasmussen, "A Unifying View of Sparse Approximat
 Regression", JMLR 2005). Poses and maps from one camera have errors of the same draws, wherever these are needed.
 """
 
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from itertools import pairwise
 from zlib import crc32
 
@@ -41,8 +41,8 @@ class LensErrors:
 
     @property
     def aspect_draws(self) -> FloatArray:
-        """(K,) of the error of the aspect ratio."""
-        return np.asarray(self._variables[1][1])
+        """(K,) of what is not known of the aspect ratio."""
+        return self._variables[2]
 
     def covariance(self, gains: FloatArray) -> FloatArray:
         """Covariance (m, m) of what has derivatives ``gains`` (n, m, 2) [1/px] by the corners."""
@@ -64,9 +64,9 @@ class LensErrors:
         bounds = pairwise([*starts.tolist(), len(gains)])
         smooth = np.stack([modes[first:end].T @ by_axes[first:end] for first, end in bounds])
         smooth = smooth.reshape(*smooth.shape[:2], *gains.shape[1:])
-        draws = np.tensordot(smooth, self._px * self._variables[0], axes=([1, 3], [0, 1]))
-        lengths = (self.of_focal_length, self._variables[1][0]), (self._of_aspect, self._aspects)
-        for of_length, drawn in lengths:
+        lens, focal_length, aspect = self._variables
+        draws = np.tensordot(smooth, self._px * lens, axes=([1, 3], [0, 1]))
+        for of_length, drawn in ((self.of_focal_length, focal_length), (self._of_aspect, aspect)):
             moved = np.einsum('nmu,nu->nm', gains, of_length.reshape(-1, 2))
             draws += np.add.reduceat(moved, starts, axis=0)[..., None] * drawn
         return np.asarray(draws)
@@ -77,20 +77,17 @@ class LensErrors:
 
     def drawn(self) -> FloatArray:
         """The errors (..., 2, K) [px] in :data:`DRAWS` draws."""
-        lens, (focal_length, _) = self._variables
+        lens, focal_length, aspect = self._variables
         smooth = np.tensordot(self.modes, self._px * lens, axes=1)
-        of_lengths = self.of_focal_length[..., None] * focal_length + self._of_aspect[..., None] * self._aspects
+        of_lengths = self.of_focal_length[..., None] * focal_length + self._of_aspect[..., None] * aspect
         return np.asarray(smooth + of_lengths)
 
-    @property
-    def _aspects(self) -> FloatArray:
-        """(K,) draws of what is not known of the aspect ratio."""
-        return self.aspect_draws if self._aspect_left is None else self._aspect_left
-
-    @property
-    def _variables(self) -> tuple[FloatArray, FloatArray]:
-        """Draws of the camera's variables."""
-        return _variables(crc32(np.ascontiguousarray(self._camera.K).tobytes()), self.modes.shape[-1])
+    @cached_property
+    def _variables(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Draws of the smooth error (I, 2, K), of the focal length (K,), and of the aspect ratio (K,)."""
+        seed = crc32(np.ascontiguousarray(self._camera.K).tobytes())
+        smooth, (focal_length, aspect) = _variables(seed, self.modes.shape[-1])
+        return smooth, focal_length, aspect if self._aspect_left is None else self._aspect_left
 
 
 def of_aspect(corners: FloatArray, camera: Camera, errors: SystematicErrors) -> FloatArray:
