@@ -12,7 +12,7 @@ import numpy as np
 
 from thermal_fiducial.config import CHI2_OF_POSE
 from thermal_fiducial.core.camera_frames import FramePeriod
-from thermal_fiducial.core.error_model import covariance_of_correlated_poses, covariance_of_one_error
+from thermal_fiducial.core.error_model import CORRELATED_POSES, covariance_of_one_error
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.located import squared_distance
@@ -60,7 +60,7 @@ class SecondClock:
             walked = self._random_walk**2 * abs(stamp_ns - self._stamp_ns) / SECOND_NS
             self.variance = min(self.variance + walked, self._prior)
         self._stamp_ns = stamp_ns
-        weighted = np.linalg.solve(covariance_of_correlated_poses(covariance), velocity)
+        weighted = np.linalg.solve(CORRELATED_POSES * covariance, velocity)
         information = float(velocity @ weighted)
         gain = self.variance / (1.0 + self.variance * information)
         self.seconds += gain * float(weighted @ apart)
