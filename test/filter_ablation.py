@@ -122,8 +122,8 @@ MECHANISMS = {
     'far poses need evidence': Mechanism(('twin marker', 'wrong poses'), off={'hypotheses:_ENOUGH_POSES': 0}),
     'contradiction in what is published': Mechanism(
         ('moved markers', 'stepping clock'),
-        ('history:History.contradicting',),
-        {'history:History.contradicting': lambda *_: None},
+        ('output:contradicting',),
+        {'output:contradicting': lambda *_: None},
     ),
 }
 

@@ -75,7 +75,7 @@ class PoseEkf:
         history.take_in()
         if history.main is None:
             return None
-        published = odometry(history.main.estimate, history.contradicting(), history.imu.last)
+        published = odometry(history, history.main)
         return published if self._T_map_first is None else in_corrected_map(published, self._T_map_first)
 
     def keep_imu(self, sample: ImuSample) -> bool:

@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterable
 from dataclasses import replace
 import math
 from operator import attrgetter
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,11 +28,8 @@ from thermal_fiducial.core.filter.propagation import propagated, random_walks
 from thermal_fiducial.core.filter.state import (
     clock_offset_derivative,
     embedded_core,
-    Estimate,
-    POSE,
     SIZE,
     TIME_OFFSET,
-    VELOCITY,
 )
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
 from thermal_fiducial.core.geometry.reprojection import screw_difference
@@ -48,17 +44,10 @@ _KEPT_EVERY_NS = 10_000_000
 _STEP_OR_LOSS = 0.5
 #: Share of the unusual steps between samples that are steps of all clocks, or of the IMU's by 35 ms and more: at all
 #: recorded gaps samples were lost.
-_STEPS = 0.1
+STEPS = 0.1
 #: Error coordinates of 1 s of clock offset alone.
 _OF_CLOCK_OFFSET = np.eye(SIZE)[TIME_OFFSET]
 _stamp = attrgetter('stamp_ns')
-
-
-class OtherEstimate(NamedTuple):
-    """Another estimate of the same instant, and the odds, 0 to 1, that it is the right one."""
-
-    estimate: Estimate
-    odds: float
 
 
 class History:
@@ -89,35 +78,12 @@ class History:
         #: main hypothesis of the latest belief, propagated to the newest sample
         self.main: Hypothesis | None = None
         #: the same if the last jump of the IMU's stamps is a step of its clock, until that is known
-        self._stepped: Hypothesis | None = None
+        self.stepped: Hypothesis | None = None
 
     @property
     def belief(self) -> Belief:
         """The latest belief."""
         return self._beliefs[-1]
-
-    def contradicting(self) -> OtherEstimate | None:
-        """Another estimate at the newest sample, if the latest poses contradict the main one.
-
-        It is the alternative if they support it, else, as with an IMU that contradicts all poses, where the last of
-        them has the robot. Also one without the time of a jump of the IMU's stamps, until the delay of poses shows
-        whether it has passed.
-        """
-        if self._stepped:
-            return OtherEstimate(self._stepped.estimate, _STEPS)
-        main, other = self.main, self.belief.alternative
-        if main is None or not main.in_doubt:
-            return None
-        if other is None or other.hits < self.config.initial_poses:
-            return OtherEstimate(self._by_refused(main), 1.0)
-        return OtherEstimate(self._carried(other, self.imu.newest_ns).estimate, 1.0)
-
-    def _by_refused(self, main: Hypothesis) -> Estimate:
-        """``main`` where its last refused pose has it, at the mean velocity that has led there since it was right."""
-        error = np.zeros(SIZE)
-        seconds = max(self.imu.newest_ns - main.accepted_ns, _KEPT_EVERY_NS) / SECOND_NS
-        error[POSE], error[VELOCITY] = main.against, main.against[3:] / seconds
-        return replace(main.estimate, state=main.estimate.state.plus(error))
 
     def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None, first_offset: float = 0.0) -> int:
         """Instant of a pose in the IMU's clock, by the clock offset of ``hypothesis``; without one ``first_offset``."""
@@ -179,21 +145,21 @@ class History:
         large one, where its stamps have ``jumped``, the robot is at the end of the jump where it was at its beginning.
         """
         newest_ns = self.imu.newest_ns
-        self._clock_steps.append((newest_ns, math.sqrt(_STEPS) * size_ns / SECOND_NS))
+        self._clock_steps.append((newest_ns, math.sqrt(STEPS) * size_ns / SECOND_NS))
         if size_ns < SMALLEST_STEP_NS:
             if self.config.estimate_time_offset:
                 self._imu_steps.append((newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
         elif jumped and self.main:
-            before = self._carried(self.main, newest_ns).estimate
-            self._stepped = self.main._replace(estimate=replace(before, stamp_ns=before.stamp_ns + size_ns))
+            before = self.carried(self.main, newest_ns).estimate
+            self.stepped = self.main._replace(estimate=replace(before, stamp_ns=before.stamp_ns + size_ns))
 
     def explain_jump(self) -> None:
         """Take a jump for time that passed: poses show that samples were lost, the clock of the IMU has not stepped."""
-        self._stepped = None
+        self.stepped = None
 
     def forget_poses(self) -> None:
         """Remove all poses and beliefs."""
-        self._poses, self._beliefs, self.main, self._stepped = [], [Belief()], None, None
+        self._poses, self._beliefs, self.main, self.stepped = [], [Belief()], None, None
 
     def _undo_from(self, stamp_ns: int) -> None:
         """Remove the beliefs after poses of ``stamp_ns`` and later."""
@@ -217,12 +183,12 @@ class History:
             self.main = belief.main
             self.log.add(belief.verdict)
         newest_ns, belief = self.imu.newest_ns, self.belief
-        if self._stepped:
-            self._stepped = self._carried(self._stepped, newest_ns)
+        if self.stepped:
+            self.stepped = self.carried(self.stepped, newest_ns)
         if self.main and belief.main:
-            self.main = self._carried(self.main, newest_ns)
+            self.main = self.carried(self.main, newest_ns)
             if newest_ns - belief.main.estimate.stamp_ns >= _KEPT_EVERY_NS:
-                other = belief.alternative and self._carried(belief.alternative, newest_ns)
+                other = belief.alternative and self.carried(belief.alternative, newest_ns)
                 self._beliefs.append(belief._replace(main=self.main, alternative=other))
         # Half of the buffer at a time: each removal moves the rest.
         if newest_ns - self.imu.oldest_ns > 2 * self._kept_ns:
@@ -319,7 +285,7 @@ class History:
     def _innovation(self, hypothesis: Hypothesis, pose: CameraPose) -> Innovation:
         """Innovation of a pose against a hypothesis at its instant, never earlier than where the hypothesis is now."""
         time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
-        estimate = self._carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate
+        estimate = self.carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate
         if step_ns := self._camera_steps.get(pose.stamp_ns, 0):
             estimate = estimate.widened(_OF_CLOCK_OFFSET, step_ns / SECOND_NS)
         for begin_ns, std in self._clock_steps:
@@ -340,7 +306,7 @@ class History:
             return innovation_of(self.config, estimate, unsure, motion)
         return nearer
 
-    def _carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
+    def carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
         """A hypothesis propagated along the samples to an instant that is not later than the newest sample."""
         estimate = hypothesis.estimate
         if estimate.stamp_ns >= until_ns:
@@ -362,7 +328,7 @@ class History:
         if self.belief.stamp_ns < horizon_ns and self.belief.main is None:
             # Initialising, and no pose for that long: only the hypothesis carried to the earliest next one is needed.
             hypotheses = self.belief.alternative, self.belief.second
-            other, second = (hypothesis and self._carried(hypothesis, horizon_ns) for hypothesis in hypotheses)
+            other, second = (hypothesis and self.carried(hypothesis, horizon_ns) for hypothesis in hypotheses)
             self._beliefs = [self.belief._replace(alternative=other, second=second)]
         while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
             del self._beliefs[0]

@@ -2,21 +2,23 @@
 
 from dataclasses import replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis
-from thermal_fiducial.core.filter.history import History, OtherEstimate
-from thermal_fiducial.core.filter.imu_buffer import LastSample
+from thermal_fiducial.core.filter.history import History, STEPS
 from thermal_fiducial.core.filter.state import (
     CORE,
     Estimate,
     GRAVITY,
     NavigationState,
+    POSE,
     POSITION,
     PUBLISHED,
     ROTATION,
+    SIZE,
     VELOCITY,
 )
 from thermal_fiducial.core.filter.update import pose_error
@@ -33,6 +35,8 @@ _AT_REST[9:, 9:12] = -np.eye(3)
 _AT_REST[:6, 12:] = np.eye(6)
 #: Flat indices of the rate's variances in a (12, 12) matrix.
 _RATE_VARIANCES = slice(9 * 13, None, 13)
+# Shortest time [ns] in which a refused pose may have moved the robot.
+_SHORTEST_NS = 10_000_000
 #: A correction beyond this [m] is a new start of the filter: spreading it would only prolong the error.
 LARGEST_STEP = 1.0
 # 99.9 % quantile of chi square with two degrees of freedom. Recorded maps lean by 1 deg, and are at 12.3 at most.
@@ -43,22 +47,54 @@ TRACKING, WAITING = Condition('tracking'), Condition('waiting for markers')
 COASTING_S = 0.5
 
 
-def odometry(estimate: Estimate, contradicting: OtherEstimate | None, sample: LastSample) -> Odometry:
-    """Odometry at an IMU sample.
+class OtherEstimate(NamedTuple):
+    """Another estimate of the same instant, and the odds, 0 to 1, that it is the right one."""
 
-    Parameters
-    ----------
-    contradicting : widens the covariance by its own, and by the square of the difference times its odds
+    estimate: Estimate
+    odds: float
+
+
+def contradicting(history: History) -> OtherEstimate | None:
+    """Another estimate at the newest sample, if the latest poses contradict the main one.
+
+    It is the alternative if they support it, else, as with an IMU that contradicts all poses, where the last of them
+    has the robot. Also one without the time of a jump of the IMU's stamps, until the delay of poses shows whether it
+    has passed.
     """
+    if history.stepped:
+        return OtherEstimate(history.stepped.estimate, STEPS)
+    main, other, newest_ns = history.main, history.belief.alternative, history.imu.newest_ns
+    if main is None or not main.in_doubt:
+        return None
+    if other is None or other.hits < history.config.initial_poses:
+        return OtherEstimate(_by_refused(main, newest_ns), 1.0)
+    return OtherEstimate(history.carried(other, newest_ns).estimate, 1.0)
+
+
+def _by_refused(main: Hypothesis, newest_ns: int) -> Estimate:
+    """``main`` where its last refused pose has it, at the mean velocity that has led there since it was right."""
+    error = np.zeros(SIZE)
+    seconds = max(newest_ns - main.accepted_ns, _SHORTEST_NS) / SECOND_NS
+    error[POSE], error[VELOCITY] = main.against, main.against[3:] / seconds
+    return replace(main.estimate, state=main.estimate.state.plus(error))
+
+
+def odometry(history: History, main: Hypothesis) -> Odometry:
+    """Odometry at the newest IMU sample, to which ``main`` is propagated.
+
+    Another estimate that contradicts it widens the covariance by its own, and by the square of the difference times its
+    odds.
+    """
+    estimate, sample, against = main.estimate, history.imu.last, contradicting(history)
     state = estimate.state
     R, velocity_body = state.R_map_body, state.velocity_body
     joint = np.zeros((18, 18))
     joint[PUBLISHED, PUBLISHED] = estimate.covariance[PUBLISHED, PUBLISHED]
     joint[12:, 12:] = estimate.pose_noise.of_map
-    if contradicting:
-        other = contradicting.estimate
+    if against:
+        other = against.estimate
         apart = _difference(state, other.state)
-        joint[CORE, CORE] += other.covariance[CORE, CORE] + contradicting.odds * np.outer(apart, apart)
+        joint[CORE, CORE] += other.covariance[CORE, CORE] + against.odds * np.outer(apart, apart)
     # Position and rotation errors turn from the robot frame into the map; that of v_body depends on nu and phi.
     J = _AT_REST.copy()
     J[0:3, POSITION] = J[3:6, ROTATION] = R
