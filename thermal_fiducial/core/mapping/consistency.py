@@ -84,10 +84,10 @@ def from_consistent_markers(
     pose = replace(
         found.pose,
         T_map_camera=one.pose.T_map_camera,
-        covariance=one.pose.covariance + spread,
+        covariance=one.pose.covariance,
         map_covariance=one.pose.map_covariance + spread,
     )
-    return replace(found, pose=pose, noise=found.noise + spread, settled=False)
+    return replace(found, pose=pose).unsettled(spread)
 
 
 class Consistency:

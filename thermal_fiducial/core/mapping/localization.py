@@ -95,7 +95,7 @@ def _by_odometry(frame: JointFit, found: Location, other: Alternative | None, od
         excess = cost - ends[0][0]
         if excess < DECISIVE and turn_between(T, ends[0][1]) > SAME_POSE:
             # Odometry must not settle it twice, in the mapper and in the filter.
-            location = _with_spread(location, unknown_turn(screw_difference(T, location.pose.T_map_camera)))
+            location = location.unsettled(unknown_turn(screw_difference(T, location.pose.T_map_camera)))
     return location
 
 
@@ -108,13 +108,7 @@ def _widened(found: Location, other: Alternative) -> Location:
     apart, covariance = difference(other.T_map_camera, found.pose.T_map_camera), found.pose.covariance
     expected = float(apart @ np.linalg.solve(covariance, apart))
     share = max(math.exp(-0.5 * other.excess) - math.exp(-0.5 * expected), 0.0)
-    return _with_spread(found, covariance_of_one_error(apart, math.sqrt(share)))
-
-
-def _with_spread(found: Location, spread: FloatArray) -> Location:
-    """A location that may be another one, at a covariance that is larger by ``spread`` (6, 6)."""
-    pose = replace(found.pose, covariance=found.pose.covariance + spread)
-    return replace(found, pose=pose, noise=found.noise + spread, settled=False)
+    return found.unsettled(covariance_of_one_error(apart, math.sqrt(share)))
 
 
 def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPose | None) -> Location | Refusal:

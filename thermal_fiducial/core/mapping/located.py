@@ -127,6 +127,11 @@ class Location:
         """Standard deviation of the attitude [rad]."""
         return math.sqrt(self.pose.covariance[3:, 3:].trace())
 
+    def unsettled(self, spread: FloatArray) -> 'Location':
+        """The location, which may be another one, at a covariance that is larger by ``spread`` (6, 6)."""
+        pose = replace(self.pose, covariance=self.pose.covariance + spread)
+        return replace(self, pose=pose, noise=self.noise + spread, settled=False)
+
     def moved(self, step: FloatArray, unknown: FloatArray) -> 'Location':
         """The location displaced by ``step`` (6,) along a screw, with what is ``unknown`` (6, 6) of it beside.
 
