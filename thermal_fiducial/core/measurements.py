@@ -256,6 +256,10 @@ class CameraPose:
     def __post_init__(self) -> None:
         _check(self, _POSE_SHAPES)
 
+    def widened(self, by: FloatArray) -> 'CameraPose':
+        """The pose with a covariance that is larger ``by`` (6, 6)."""
+        return replace(self, covariance=self.covariance + by)
+
 
 def in_moved_map(pose: CameraPose, T_new_old: FloatArray) -> CameraPose:
     """``pose`` in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""

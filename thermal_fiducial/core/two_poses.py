@@ -48,7 +48,7 @@ def mean_of_two(mean: CameraPose, half: FloatArray, likelier: CameraPose) -> Cam
         to_pose = lever_arm(pose.T_map_camera[:3, 3] - mean.T_map_camera[:3, 3])
         for unknown in (half, np.concatenate([np.cross(to_axis, across), across])):
             spread += unknown_turn(to_pose @ unknown)
-    return replace(pose, covariance=pose.covariance + spread)
+    return pose.widened(np.asarray(spread))
 
 
 def possible_poses(pose: CameraPose) -> list[CameraPose]:

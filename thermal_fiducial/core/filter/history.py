@@ -302,7 +302,7 @@ class History:
         if farther and farther[0].nis - nearer.nis < DECISIVE:
             # The estimate does not show which of the two it is: then nothing is known of the turn between them.
             between = unknown_turn(screw_difference(possible[0].T_map_camera, pose.T_map_camera))
-            unsure = body_pose(replace(pose, covariance=pose.covariance + between), on_robot, scale)
+            unsure = body_pose(pose.widened(between), on_robot, scale)
             return innovation_of(self.config, estimate, unsure, motion)
         return nearer
 

@@ -154,7 +154,7 @@ class JointFit:
         covariances = self.sight.map_covariances
         best = int(np.argmin(np.trace(covariances, axis1=1, axis2=2)))
         to_camera = lever_arm(odometry.T_map_camera[:3, 3] - self.sight.T_map_marker[best, :3, 3])
-        return replace(odometry, covariance=odometry.covariance + to_camera @ covariances[best] @ to_camera.T)
+        return odometry.widened(to_camera @ covariances[best] @ to_camera.T)
 
     def likeliest(self, start: FloatArray, prior: CameraPose, weights: FloatArray) -> tuple[float, FloatArray] | None:
         """The likeliest camera (4, 4) by corners and ``prior``, from a ``start`` (4, 4), and its cost, chi square.

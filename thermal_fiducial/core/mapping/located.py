@@ -129,8 +129,7 @@ class Location:
 
     def unsettled(self, spread: FloatArray) -> 'Location':
         """The location, which may be another one, at a covariance that is larger by ``spread`` (6, 6)."""
-        pose = replace(self.pose, covariance=self.pose.covariance + spread)
-        return replace(self, pose=pose, noise=self.noise + spread, settled=False)
+        return replace(self, pose=self.pose.widened(spread), noise=self.noise + spread, settled=False)
 
     def moved(self, step: FloatArray, unknown: FloatArray) -> 'Location':
         """The location displaced by ``step`` (6,) along a screw, with what is ``unknown`` (6, 6) of it beside.

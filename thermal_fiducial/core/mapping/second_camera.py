@@ -117,9 +117,8 @@ class SecondCamera:
 
     def _of_first(self, pose: CameraPose) -> CameraPose:
         """A pose of the second camera as one of the first: the errors of both mounts are between the two."""
-        with_own = replace(pose, covariance=pose.covariance + self._mount_covariance)
-        of_first = seen_from(with_own, self._T_second_first)
-        return replace(of_first, covariance=of_first.covariance + self._mount_covariance)
+        of_first = seen_from(pose.widened(self._mount_covariance), self._T_second_first)
+        return of_first.widened(self._mount_covariance)
 
     def forget(self) -> None:
         """Drop the pose that waits for one of the first camera: it is in a map that was replaced."""
@@ -166,7 +165,7 @@ class SecondCamera:
             return None
         velocity = np.zeros(6) if middle is None else middle.velocity
         of_clock = covariance_of_one_error(velocity, np.sqrt(self.clock.variance))
-        return replace(moved, covariance=moved.covariance + of_clock), moved, velocity
+        return moved.widened(of_clock), moved, velocity
 
 
 def seen_from(pose: CameraPose, T_camera_other: FloatArray) -> CameraPose:

@@ -63,8 +63,7 @@ class UndeclaredReadout:
         if predicted is None or self.std == 0.0:
             return location
         moved = np.einsum('nij,nj->i', location.corner_gains, _rates(location, camera, predicted).reshape(-1, 2))
-        covariance = location.pose.covariance + covariance_of_one_error(moved, self.std)
-        return replace(location, pose=replace(location.pose, covariance=covariance))
+        return replace(location, pose=location.pose.widened(covariance_of_one_error(moved, self.std)))
 
     def explained(self, location: Location, camera: Camera, predicted: PredictedCamera | None) -> Location:
         """The location with residuals of lens and detector alone: without those by the most likely time."""
