@@ -29,7 +29,7 @@ class Priors:
     information: FloatArray
 
     def divided(self, factor: float) -> 'Priors':
-        """Those whose covariances are this, once divided by a ``factor`` of all variances of an adjustment."""
+        """The same with covariances divided by a ``factor``, by which all of an adjustment are multiplied later."""
         return Priors(self.T, factor * self.information)
 
     def apart(self, T: FloatArray) -> tuple[FloatArray, FloatArray]:
