@@ -48,7 +48,7 @@ def drawn(model, view):
 
 def look(image, camera, T_expected, noise, marker_id=ID, config=CONFIG, twist=STILL):
     """What is found of a marker where it is expected."""
-    frame = Frame(0, image.astype(np.float32), noise, camera, twist, LAG, 0.0, CONFIG.blur_px)
+    frame = Frame(0, image.astype(np.float32), noise, camera, twist, LAG, 0.0, CONFIG.blur_px, image)
     return look_at(frame, T_expected, marker_id, config)
 
 

@@ -26,7 +26,8 @@ from thermal_fiducial.files.dictionary import load_dictionary
 
 CAMERA = Camera(640, 512, [[440.0, 0, 319.5], [0, 440.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
 TWIST = Twist(np.array([0.8, -1.5, 0.6, -1.8, 1.5, 0.8]), np.eye(6), np.array([3.0, 0.0, 2.0, 6.0, -4.0, 5.0]))
-FRAME = Frame(0, np.zeros((512, 640), dtype=np.float32), 1.0, CAMERA, TWIST, 0.0, 0.025, 0.66)
+IMAGE = np.zeros((512, 640), dtype=np.float32)
+FRAME = Frame(0, IMAGE, 1.0, CAMERA, TWIST, 0.0, 0.025, 0.66, IMAGE)
 
 
 def points():
@@ -102,7 +103,7 @@ def test_corners_of_rows_that_are_read_early_claim_what_the_twist_is_uncertain_b
     corners = np.array([279.5, 39.5]) + 72.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     camera, one = Camera(640, 512, [[440.0, 0, 319.5], [0, 440.0, 255.5], [0, 0, 1]]), np.ones(1, dtype=bool)
     still = Twist(np.zeros(6), np.diag([0.0, 0.0, 0.0, 0.1, 0.1, 0.0]) ** 2)
-    frame = Frame(0, image.astype(np.float32), 1.0, camera, still, 0.0, 0.025, ArucoDetectorConfig().blur_px)
+    frame = Frame(0, image.astype(np.float32), 1.0, camera, still, 0.0, 0.025, ArucoDetectorConfig().blur_px, image)
     found = FoundMarkers(
         np.array([7]),
         Places.of(ImagePoints.at(corners[None], camera), np.ones((1, 4))),

@@ -44,7 +44,7 @@ CORNERS = np.array([[199.5, 149.5], [271.5, 149.5], [271.5, 221.5], [199.5, 221.
 def frame_of(image):
     height, width = image.shape
     camera = Camera(width, height, [[500.0, 0, width / 2], [0, 500.0, height / 2], [0, 0, 1]])
-    return Frame(0, image, pixel_noise(image), camera, None, 0.0, 0.0, ArucoDetectorConfig().blur_px)
+    return Frame(0, image, pixel_noise(image), camera, None, 0.0, 0.0, ArucoDetectorConfig().blur_px, image)
 
 
 def search(image, config=None, allowed=EVERY, scales=SearchScales.ALL):

@@ -79,10 +79,10 @@ class Frame:
     readout: float
     #: standard deviation of the blur by optics and pixels [px]
     blur_px: float
+    #: (height, width) as received
+    received: Counts | Gray
     #: whether it is a picture for a display, whose gain control is a nonlinear function of the counts
     displayed: bool = False
-    #: (height, width) as received
-    received: Counts | Gray | None = None
     #: counts of black and of white in a picture for a display
     ends: tuple[float, float] = (0.0, _LEVELS - 1.0)
 
@@ -100,7 +100,7 @@ class Frame:
         noise, displayed = pixel_noise(counts), bool(counts[::_ROW_STEP].max() < _LEVELS)
         pixels = counts if keep_columns else with_columns_corrected(counts.astype(np.float32), noise)
         lag, readout, blur_px = config.bolometer_lag, config.readout_time, config.blur_px
-        return Frame(stamp_ns, pixels, noise, camera, twist, lag, readout, blur_px, displayed, counts)
+        return Frame(stamp_ns, pixels, noise, camera, twist, lag, readout, blur_px, counts, displayed)
 
     @cached_property
     def image(self) -> Float32Array:
@@ -110,14 +110,13 @@ class Frame:
     @cached_property
     def saturation(self) -> 'Saturation | None':
         """Where its gray scale ends; None: nowhere, or raw counts."""
-        return None if self.received is None or not self.displayed else Saturation.of(self.received, *self.ends)
+        return Saturation.of(self.received, *self.ends) if self.displayed else None
 
     def in_counts(self, counts_of_levels: FloatArray) -> 'Frame':
         """The frame with counts for the gray levels of a picture for a display, by those (256,) of each level.
 
         Columns differ by an offset of counts, which the scale bends.
         """
-        assert self.received is not None
         image = _by_levels(self.received, counts_of_levels.astype(np.float32))
         noise, ends = pixel_noise(image), (counts_of_levels[0], counts_of_levels[-1])
         return replace(self, pixels=with_columns_corrected(image, noise), noise=noise, ends=ends)
