@@ -13,27 +13,16 @@ from operator import attrgetter
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseLog, PoseUpdate
+from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseLog
 from thermal_fiducial.core.filter.camera_clock import SMALLEST_STEP_NS
-from thermal_fiducial.core.filter.hypotheses import (
-    alternative_to,
-    contradiction,
-    first_hypothesis,
-    relinearises,
-    weigh,
-)
+from thermal_fiducial.core.filter.hypotheses import belief_after, relinearises
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
-from thermal_fiducial.core.filter.initialization import TWO_POSES, WINDOW_SECONDS
+from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
 from thermal_fiducial.core.filter.propagation import propagated, random_walks
-from thermal_fiducial.core.filter.state import (
-    clock_offset_derivative,
-    embedded_core,
-    SIZE,
-    TIME_OFFSET,
-)
+from thermal_fiducial.core.filter.state import clock_offset_derivative, embedded_core, SIZE, TIME_OFFSET
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
 from thermal_fiducial.core.geometry.reprojection import screw_difference
-from thermal_fiducial.core.measurements import CameraPose, Condition
+from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.two_poses import DECISIVE, possible_poses, unknown_turn
 from thermal_fiducial.core.types import SECOND_NS
 
@@ -108,7 +97,7 @@ class History:
         for belief in reversed(self._beliefs):
             time_ns = min(self.due_ns(pose, belief.main), self.imu.newest_ns)
             if belief.main and belief.main.estimate.stamp_ns <= time_ns:
-                return self._innovation(belief.main, pose)
+                return self.innovation(belief.main, pose)
         return None
 
     # --- poses, and suspected steps of the clocks -----------------------------------------------------
@@ -176,7 +165,7 @@ class History:
         """Apply all poses up to the newest sample, log the verdicts on them, and propagate to that sample."""
         while (pose := self._next_due()) is not None:
             self._undo_propagation_beyond(pose)
-            belief = self._after(pose)
+            belief = belief_after(self, pose)
             if self._relinearise(belief):
                 continue
             self._beliefs.append(belief)
@@ -212,58 +201,6 @@ class History:
                 return
             del self._beliefs[-1]
 
-    def _after(self, pose: CameraPose) -> Belief:
-        """The belief after the next pose."""
-        config, verdict = self.config, PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)
-        belief = self.belief._replace(verdict=verdict)
-        main, other = belief.main, belief.alternative
-        if not belief.hypotheses:
-            return self._begun(belief, pose)
-        if main:
-            innovation = self._innovation(main, pose)
-            main, verdict = weigh(config, main, innovation, pose.stamp_ns)
-            belief = belief._replace(main=main, verdict=verdict)
-            if other is None and not verdict.accepted and len(possible_poses(pose)) == 1:
-                belief = self._with_alternative(belief, main, innovation)
-        if other:
-            innovation = self._innovation(other, pose)
-            alternative, verdict = weigh(config, other, innovation, pose.stamp_ns)
-            belief = belief._replace(alternative=alternative)
-            if main is None and not verdict.accepted:
-                belief = belief._replace(contradiction=contradiction(config, other, innovation))
-            if belief.second:
-                second, _ = weigh(config, belief.second, self._innovation(belief.second, pose), pose.stamp_ns)
-                # Each by itself would adapt to what speaks against it.
-                first, second = (h.with_noise(other.estimate.pose_noise) for h in (alternative, second))
-                belief = belief._replace(alternative=first, second=second, contradiction=TWO_POSES)
-        return belief.settled(config)
-
-    def _begun(self, belief: Belief, pose: CameraPose) -> Belief:
-        """``belief``, which is empty, with an alternative hypothesis begun from a pose, or one from each of two."""
-        time_ns = max(self.due_ns(pose, None, belief.first_offset), self.imu.oldest_ns)
-        window = self.imu.window(time_ns, WINDOW_SECONDS)
-        outcomes = [
-            first_hypothesis(self.config, possible, time_ns, window, belief.first_offset)
-            for possible in possible_poses(pose)
-        ]
-        alternative, second, *_ = [h for h in outcomes if isinstance(h, Hypothesis)] + [None, None]
-        if alternative is None:
-            condition = next(outcome for outcome in outcomes if isinstance(outcome, Condition))
-            why = 'two poses are possible' if condition is TWO_POSES else 'contradicts gravity'
-            refused = PoseUpdate(pose.stamp_ns, False, f'refused: {why}', math.nan)
-            return belief._replace(contradiction=condition, verdict=refused)
-        return belief._replace(alternative=alternative, second=second).settled(self.config)
-
-    def _with_alternative(self, belief: Belief, main: Hypothesis, refused: Innovation) -> Belief:
-        """``belief`` with an alternative hypothesis begun from a pose that its ``main`` one has just refused."""
-        window = self.imu.window(refused.estimate.stamp_ns, WINDOW_SECONDS)
-        begun = alternative_to(self.config, main, refused, window)
-        if begun is None:
-            return belief
-        drifted = begun.needed == 0 or (belief.drifted and main.refused_in_row > 1)
-        begun = begun._replace(needed=0) if drifted else begun
-        return belief._replace(alternative=begun, hits_before=main.hits, drifted=drifted)
-
     def _relinearise(self, belief: Belief) -> bool:
         """Return to before an initialisation that ends with ``belief`` if it must begin once more; whether it must.
 
@@ -282,7 +219,7 @@ class History:
         self._beliefs[-1] = self.belief._replace(first_offset=offset)
         return True
 
-    def _innovation(self, hypothesis: Hypothesis, pose: CameraPose) -> Innovation:
+    def innovation(self, hypothesis: Hypothesis, pose: CameraPose) -> Innovation:
         """Innovation of a pose against a hypothesis at its instant, never earlier than where the hypothesis is now."""
         time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
         estimate = self.carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate

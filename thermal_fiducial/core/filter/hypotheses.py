@@ -1,13 +1,14 @@
-"""Hypotheses: how they are initialised, and updated by poses that pass the gate."""
+"""Hypotheses: how they are initialised, and updated by poses that pass the gate; what a pose makes of the belief."""
 
 from dataclasses import replace
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.belief import Hypothesis, PoseUpdate
-from thermal_fiducial.core.filter.initialization import blank_state, cost_of_vertical, start
+from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseUpdate
+from thermal_fiducial.core.filter.initialization import blank_state, cost_of_vertical, start, TWO_POSES, WINDOW_SECONDS
 from thermal_fiducial.core.filter.state import POSE, TIME_OFFSET
 from thermal_fiducial.core.filter.update import (
     adapted_noise,
@@ -18,7 +19,11 @@ from thermal_fiducial.core.filter.update import (
     with_unknown_clock,
 )
 from thermal_fiducial.core.measurements import CameraPose, Condition
+from thermal_fiducial.core.two_poses import possible_poses
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
+
+if TYPE_CHECKING:
+    from thermal_fiducial.core.filter.history import History
 
 #: Standard deviation [s] below which the clock offset counts as known, and the least that an alternative hypothesis
 #: begins with: in the fastest flights it moves a marker by a pixel or two.
@@ -29,6 +34,61 @@ _MOVED_OFFSET = 3.0
 #: added: probably a moved or duplicated marker. An alternative hypothesis that begins there needs as many poses as the
 #: estimate has accepted, at most _ENOUGH_POSES. Nearer ones need fewer: coasting for long would do more harm.
 _FAR_TOO_SURE, _FAR, _ENOUGH_POSES = 10.0, np.repeat([0.05, 0.2], 3), 300
+
+
+def belief_after(history: 'History', pose: CameraPose) -> Belief:
+    """The belief of a ``history`` after the next pose."""
+    config, verdict = history.config, PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)
+    belief = history.belief._replace(verdict=verdict)
+    main, other = belief.main, belief.alternative
+    if not belief.hypotheses:
+        return _begun(history, belief, pose)
+    if main:
+        innovation = history.innovation(main, pose)
+        main, verdict = weigh(config, main, innovation, pose.stamp_ns)
+        belief = belief._replace(main=main, verdict=verdict)
+        if other is None and not verdict.accepted and len(possible_poses(pose)) == 1:
+            belief = _with_alternative(history, belief, main, innovation)
+    if other:
+        innovation = history.innovation(other, pose)
+        alternative, verdict = weigh(config, other, innovation, pose.stamp_ns)
+        belief = belief._replace(alternative=alternative)
+        if main is None and not verdict.accepted:
+            belief = belief._replace(contradiction=_contradiction(config, other, innovation))
+        if belief.second:
+            second, _ = weigh(config, belief.second, history.innovation(belief.second, pose), pose.stamp_ns)
+            # Each by itself would adapt to what speaks against it.
+            first, second = (h.with_noise(other.estimate.pose_noise) for h in (alternative, second))
+            belief = belief._replace(alternative=first, second=second, contradiction=TWO_POSES)
+    return belief.settled(config)
+
+
+def _begun(history: 'History', belief: Belief, pose: CameraPose) -> Belief:
+    """``belief``, which is empty, with an alternative hypothesis begun from a pose, or one from each of two."""
+    time_ns = max(history.due_ns(pose, None, belief.first_offset), history.imu.oldest_ns)
+    window = history.imu.window(time_ns, WINDOW_SECONDS)
+    outcomes = [
+        _first_hypothesis(history.config, possible, time_ns, window, belief.first_offset)
+        for possible in possible_poses(pose)
+    ]
+    alternative, second, *_ = [h for h in outcomes if isinstance(h, Hypothesis)] + [None, None]
+    if alternative is None:
+        condition = next(outcome for outcome in outcomes if isinstance(outcome, Condition))
+        why = 'two poses are possible' if condition is TWO_POSES else 'contradicts gravity'
+        refused = PoseUpdate(pose.stamp_ns, False, f'refused: {why}', math.nan)
+        return belief._replace(contradiction=condition, verdict=refused)
+    return belief._replace(alternative=alternative, second=second).settled(history.config)
+
+
+def _with_alternative(history: 'History', belief: Belief, main: Hypothesis, refused: Innovation) -> Belief:
+    """``belief`` with an alternative hypothesis begun from a pose that its ``main`` one has just refused."""
+    window = history.imu.window(refused.estimate.stamp_ns, WINDOW_SECONDS)
+    begun = _alternative_to(history.config, main, refused, window)
+    if begun is None:
+        return belief
+    drifted = begun.needed == 0 or (belief.drifted and main.refused_in_row > 1)
+    begun = begun._replace(needed=0) if drifted else begun
+    return belief._replace(alternative=begun, hits_before=main.hits, drifted=drifted)
 
 
 def weigh(
@@ -63,7 +123,7 @@ def _shown(hypothesis: Hypothesis, innovation: Innovation) -> float:
     return hypothesis.shown + max(0.0, float(against @ innovation.S_inverse @ against) - len(against))
 
 
-def contradiction(config: PoseEkfConfig, hypothesis: Hypothesis, innovation: Innovation) -> Condition:
+def _contradiction(config: PoseEkfConfig, hypothesis: Hypothesis, innovation: Innovation) -> Condition:
     """Which sensor of the IMU a pose contradicts that the ``hypothesis`` refuses."""
     turn, shift = innovation.value[:3], innovation.value[3:]
     seconds = (innovation.estimate.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
@@ -83,7 +143,7 @@ def passes_with_unknown_clock(config: PoseEkfConfig, innovation: Innovation) -> 
     return with_covariance(config, innovation, covariance).nis <= config.gate
 
 
-def first_hypothesis(
+def _first_hypothesis(
     config: PoseEkfConfig, pose: CameraPose, time_ns: int, window: FloatArray, time_offset: float
 ) -> Hypothesis | Condition:
     """A hypothesis initialised from a pose without prior, or why none begins with it.
@@ -108,7 +168,7 @@ def relinearises(begun: Hypothesis, first_offset: float) -> bool:
     return moved > max(KNOWN_OFFSET_STD, _MOVED_OFFSET * estimate.std(TIME_OFFSET))
 
 
-def alternative_to(
+def _alternative_to(
     config: PoseEkfConfig, main: Hypothesis, innovation: Innovation, window: FloatArray
 ) -> Hypothesis | None:
     """A hypothesis initialised from a pose that ``main`` refuses; None where nothing begins with it.
