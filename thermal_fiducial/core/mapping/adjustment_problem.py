@@ -15,7 +15,7 @@ from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.lens_errors import of_aspect
 from thermal_fiducial.core.mapping.map_data import exact, gauge, MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations, Vectors
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 # Variance that is added to those of priors [m^2, rad^2]: no place is known better than to 0.1 mm and mrad.
 _LEAST_VARIANCE = 1e-8
@@ -249,26 +249,6 @@ class MapProblem:
             return None
         step = system.solve(sides)
         return self.evaluate(now.state.moved(step)) if all(np.all(np.isfinite(part)) for part in step) else None
-
-    def mirrored(self, state: Poses) -> Poses:
-        """The state with each marker in about the other pose that its views allow: turned by 180 deg about them."""
-        sight = state.T_map_camera[self.frame, :3, 3] - state.T_map_marker[self.marker, :3, 3]
-        mean = self.over_markers(sight / np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), TINY))
-        mean /= np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), TINY)
-        about_sight = 2.0 * mean[:, :, None] * mean[:, None, :] - np.eye(3)
-        T_map_marker = state.T_map_marker.copy()
-        T_map_marker[:, :3, :3] = about_sight @ T_map_marker[:, :3, :3] @ np.diag([-1.0, -1.0, 1.0])
-        return replace(state, T_map_marker=T_map_marker)
-
-    def markers_stepped(self, now: Linearised, scale: float) -> Poses:
-        """After one Gauss-Newton step of each marker alone."""
-        J_transposed = now.weights(scale)[:, None, None] * np.swapaxes(now.J, -1, -2)
-        known = self.known.weighted(now.marker_chi2)
-        information = self.over_markers(J_transposed @ now.J) + known
-        sides = self.over_markers(J_transposed @ now.r[..., None]) + known @ now.marker_apart[..., None]
-        largest = np.max(information, axis=(1, 2), keepdims=True)
-        steps = np.linalg.solve(information + (TINY * largest + TINY) * np.eye(6), sides)
-        return replace(now.state, T_map_marker=retract(now.state.T_map_marker, steps[..., 0]))
 
     def only(self, views: BoolArray) -> 'MapProblem':
         """The same unknowns with some of the ``views`` (n,); for steps of markers alone."""

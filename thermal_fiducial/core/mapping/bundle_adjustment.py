@@ -15,8 +15,9 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import noise_factor
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import retract
 from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
-from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Snapshot
+from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Poses, Snapshot
 from thermal_fiducial.core.mapping.candidates import MAX_VIEWS, UNAMBIGUOUS
 from thermal_fiducial.core.mapping.error_sources import ErrorSources
 from thermal_fiducial.core.mapping.map_data import MapMarker
@@ -151,11 +152,33 @@ def _mirrored(problem: MapProblem, now: Linearised, views: BoolArray, scale: flo
     Both by some of the ``views`` (n,).
     """
     by_some = problem.only(views)
-    other = by_some.mirrored(now.state)
+    other = _turned(by_some, now.state)
     for _ in range(_MIRRORED_STEPS):
-        other = by_some.markers_stepped(by_some.evaluate(other), scale)
+        other = _markers_stepped(by_some, by_some.evaluate(other), scale)
     gains = now.view_costs(scale)[views] - by_some.evaluate(other).view_costs(scale)
     return other.T_map_marker, by_some.over_markers(gains)
+
+
+def _turned(problem: MapProblem, state: Poses) -> Poses:
+    """The state with each marker in about the other pose that its views allow: turned by 180 deg about them."""
+    sight = state.T_map_camera[problem.frame, :3, 3] - state.T_map_marker[problem.marker, :3, 3]
+    mean = problem.over_markers(sight / np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), TINY))
+    mean /= np.maximum(np.linalg.norm(mean, axis=-1, keepdims=True), TINY)
+    about_sight = 2.0 * mean[:, :, None] * mean[:, None, :] - np.eye(3)
+    T_map_marker = state.T_map_marker.copy()
+    T_map_marker[:, :3, :3] = about_sight @ T_map_marker[:, :3, :3] @ np.diag([-1.0, -1.0, 1.0])
+    return replace(state, T_map_marker=T_map_marker)
+
+
+def _markers_stepped(problem: MapProblem, now: Linearised, scale: float) -> Poses:
+    """After one Gauss-Newton step of each marker alone."""
+    J_transposed = now.weights(scale)[:, None, None] * np.swapaxes(now.J, -1, -2)
+    known = problem.known.weighted(now.marker_chi2)
+    information = problem.over_markers(J_transposed @ now.J) + known
+    sides = problem.over_markers(J_transposed @ now.r[..., None]) + known @ now.marker_apart[..., None]
+    largest = np.max(information, axis=(1, 2), keepdims=True)
+    steps = np.linalg.solve(information + (TINY * largest + TINY) * np.eye(6), sides)
+    return replace(now.state, T_map_marker=retract(now.state.T_map_marker, steps[..., 0]))
 
 
 def _scale(chi2: FloatArray) -> float:
