@@ -19,13 +19,25 @@ from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, VAGUE
 from thermal_fiducial.core.two_poses import DECISIVE, mean_of_two, unknown_turn
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.core.wording import marker_names
 
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.
 _PROPOSERS = 4
 # Standard deviation of a rotation beyond which the linearisation of a fit without odometry means nothing [rad].
 _MEANINGLESS = 1.0
+# Longest time [ns] for which the last pose resolves the planar ambiguity of the next.
+_CONTINUITY_NS = 300_000_000
+# Standard deviation of a robot's rates about each axis [rad/s], where nothing measures them.
+_USUAL_RATE = 0.5
+
+
+def last_at(stamp_ns: int, last: CameraPose | None) -> CameraPose | None:
+    """The ``last`` pose for a frame that follows soon, uncertain by what a robot may have turned since."""
+    if last is None or not 0 < stamp_ns - last.stamp_ns < _CONTINUITY_NS:
+        return None
+    turn = _USUAL_RATE * (stamp_ns - last.stamp_ns) / SECOND_NS
+    return last.widened(np.diag([0.0, 0.0, 0.0, turn, turn, turn]) ** 2)
 
 
 def locate(

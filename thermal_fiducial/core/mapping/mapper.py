@@ -24,21 +24,17 @@ from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers
 from thermal_fiducial.core.mapping.consistency import Consistency, from_consistent_markers
 from thermal_fiducial.core.mapping.corner_bias import CornerBias
 from thermal_fiducial.core.mapping.keyframes import KeyframeStore, VIEWS
-from thermal_fiducial.core.mapping.localization import locate
+from thermal_fiducial.core.mapping.localization import last_at, locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import jump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.undeclared_readout import UndeclaredReadout
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
-from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
+from thermal_fiducial.core.types import BoolArray, FloatArray
 
 #: Reason for which the map is not updated from a frame with a pose.
 CONTRADICTED = 'the known markers in view contradict the odometry'
-#: Longest time [ns] for which the last pose resolves the planar ambiguity of the next.
-CONTINUITY_NS = 300_000_000
-# Standard deviation of a robot's rates about each axis [rad/s], where nothing measures them.
-_USUAL_RATE = 0.5
 #: ID of a new marker in view to the reason, in words, for which it is not in the map yet.
 Waiting = dict[int, str]
 
@@ -138,7 +134,7 @@ class MarkerMapper:
         sight = known if known.trusted.all() else known.only(known.trusted)
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.sizes):
-            odometry, last = (None, self._last_at(stamp_ns)) if predicted is None else (predicted.pose, None)
+            odometry, last = (None, last_at(stamp_ns, self._last)) if predicted is None else (predicted.pose, None)
             fit = partial(locate, stamp_ns, camera=camera, model=errors, odometry=odometry, last=last)
             outcome = from_consistent_markers(sight, camera, predicted, fit)
             if isinstance(outcome, Location):
@@ -154,16 +150,6 @@ class MarkerMapper:
         """Which of N markers are in the map, (N,), and these with their entries."""
         is_known = np.array([key in self.map.markers for key in observed.ids.tolist()], dtype=np.bool_)
         return is_known, Sight.of(observed if is_known.all() else observed.only(is_known), self.map)
-
-    def _last_at(self, stamp_ns: int) -> CameraPose | None:
-        """The last pose for a frame that follows soon, uncertain by what a robot may have turned since."""
-        last = self._last
-        if last is None or not 0 < stamp_ns - last.stamp_ns < CONTINUITY_NS:
-            return None
-        turn = _USUAL_RATE * (stamp_ns - last.stamp_ns) / SECOND_NS
-        covariance = last.covariance.copy()
-        covariance[3:, 3:] += turn**2 * np.eye(3)
-        return replace(last, covariance=covariance)
 
     @property
     def errors(self) -> SystematicErrors:
