@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from thermal_fiducial.config import CHI2_OF_POSE
-from thermal_fiducial.core.error_model import CHI2_OF_VIEW, SystematicErrors
+from thermal_fiducial.core.error_model import CHI2_OF_VIEW, READOUT_STD, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, marker_corners, retract, whitening
 from thermal_fiducial.core.geometry.rigid_fit import BEHIND_CHI2, Images, linearised, robust
@@ -64,11 +64,15 @@ class Snapshot:
     ids: IntArray
     corners: FloatArray
     covariances: FloatArray
+    #: (n, 4, 2) [px/s] what corners are displaced by each second that the readout time is declared too short by
+    rates: FloatArray
     #: prior pose and covariance (6, 6) by ID, of markers of an earlier map
     known: Mapping[int, tuple[FloatArray, FloatArray]]
     map_revision: int
     #: systematic errors that enter the covariances
     errors: SystematicErrors
+    #: what the readout time is known to be declared too short by [s]
+    readout: float = 0.0
 
     def useful(self) -> BoolArray:
         """Which views (n,) constrain the map and are connected with a held or prior marker, by markers or odometry.
@@ -106,20 +110,21 @@ class Snapshot:
 class Poses:
     """Poses of all keyframes (F, 4, 4) and markers (M, 4, 4), and of the frame of the odometry (4, 4).
 
-    And the error of the aspect ratio (1,), in units of its standard deviation.
+    And the error of the aspect ratio, and that of the readout time where it is estimated (L,), in units of their
+    standard deviations.
     """
 
     T_map_camera: FloatArray
     T_map_marker: FloatArray
-    lens: FloatArray
+    common: FloatArray
     T_map_odometry: FloatArray = field(default_factory=lambda: np.eye(4))
 
     def moved(self, step: Vectors) -> 'Poses':
-        """By steps (F, 6, 1) of the keyframes, (M + 1, 6, 1) of markers and, last, odometry, and (1, 1) of the lens."""
+        """By steps (F, 6, 1) of the keyframes, (M + 1, 6, 1) of markers and odometry, (L, 1) of what views share."""
         return Poses(
             retract(self.T_map_camera, step.frames[..., 0]),
             retract(self.T_map_marker, step.nodes[:-1, :, 0]),
-            self.lens + step.common[:, 0],
+            self.common + step.common[:, 0],
             retract(self.T_map_odometry, step.nodes[-1, :, 0]),
         )
 
@@ -141,8 +146,8 @@ class Linearised:
     camera_chi2: FloatArray
     marker_apart: FloatArray
     marker_chi2: FloatArray
-    #: chi square of the prior of the aspect ratio's error
-    lens_chi2: float
+    #: chi square of the priors of what all views have in common
+    common_chi2: float
 
     def weights(self, scale: float) -> FloatArray:
         """Robust weights (n,) of the views, for corners of ``scale`` times their variance."""
@@ -155,7 +160,7 @@ class Linearised:
     def cost(self, scale: float) -> float:
         """Robust sum of squares."""
         of_priors = robust(np.concatenate([self.camera_chi2, self.marker_chi2]), CHI2_OF_POSE)[0]
-        return float(np.sum(self.view_costs(scale)) + np.sum(of_priors) + self.lens_chi2)
+        return float(np.sum(self.view_costs(scale)) + np.sum(of_priors) + self.common_chi2)
 
 
 @dataclass(frozen=True)
@@ -175,12 +180,14 @@ class MapProblem:
     corners: FloatArray
     W: FloatArray
     images: Images
-    #: (n, 8, 1) whitened corners by one standard deviation of the aspect ratio
-    J_lens: FloatArray
+    #: (n, 8, L) whitened corners by one standard deviation of the aspect ratio, and of the readout time
+    J_common: FloatArray
+    #: (n, 8, 1) the latter
+    J_readout: FloatArray
     odometry: Priors
     known: Priors
-    #: of the prior of that error
-    lens_information: float = 1.0
+    #: (L,) of the priors of these
+    common_information: FloatArray
 
     @classmethod
     def build(cls, snapshot: Snapshot) -> 'MapProblem | None':
@@ -195,9 +202,10 @@ class MapProblem:
         T_map_marker = np.stack([m.T_map_marker for m in markers])
         camera = snapshot.camera
         corners, W = snapshot.corners[views], whitening(snapshot.covariances[views])
-        J_lens = (W @ of_aspect(corners, camera, snapshot.errors)[..., None]).reshape(-1, 8, 1)
+        corners = corners - snapshot.readout * snapshot.rates[views]
+        J_common = (W @ of_aspect(corners, camera, snapshot.errors)[..., None]).reshape(-1, 8, 1)
         return cls(
-            start=Poses(snapshot.T_map_camera[frames], T_map_marker, np.zeros(J_lens.shape[-1])),
+            start=Poses(snapshot.T_map_camera[frames], T_map_marker, np.zeros(J_common.shape[-1])),
             ids=marker_ids.tolist(),
             stamps=snapshot.stamps_ns[frames].tolist(),
             sizes=np.array([m.size for m in markers]),
@@ -209,10 +217,20 @@ class MapProblem:
             corners=corners,
             W=W,
             images=Images.of(ImagePoints.at(corners, camera), W),
-            J_lens=J_lens,
+            J_common=J_common,
+            J_readout=READOUT_STD * (W @ snapshot.rates[views][..., None]).reshape(-1, 8, 1),
             odometry=Priors(snapshot.odometry.T[frames], snapshot.odometry.information[frames]),
             known=_known(snapshot, marker_ids, T_map_marker),
+            common_information=np.ones(1),
         )
+
+    def with_readout(self) -> 'MapProblem':
+        """With the error of the readout time among the unknowns."""
+        J, information = (
+            np.concatenate([self.J_common, self.J_readout], axis=-1),
+            np.append(self.common_information, 1.0),
+        )
+        return replace(self, J_common=J, common_information=information)
 
     def evaluate(self, state: Poses) -> Linearised:
         """Whitened residuals and derivatives."""
@@ -222,7 +240,7 @@ class MapProblem:
         off, J, seen = linearised(T_camera_map @ T_map_marker, corners, self.images)
         # From the axes of the camera to those of the map.
         J = (J.reshape(n, 16, 3) @ T_camera_map[:, :3, :3]).reshape(n, 8, 6)
-        r = -off.reshape(n, 8) - self.J_lens @ state.lens
+        r = -off.reshape(n, 8) - self.J_common @ state.common
         # Markers behind the camera have no gradient, and the cost of an outlier.
         r[~seen], J[~seen] = 0.0, 0.0
         chi2 = np.where(seen, np.sum(r * r, axis=-1), BEHIND_CHI2)
@@ -233,8 +251,8 @@ class MapProblem:
         by_odometry = Priors(state.T_map_odometry @ self.odometry.T, self.odometry.information)
         of_cameras = by_odometry.apart(state.T_map_camera)
         of_markers = self.known.apart(state.T_map_marker)
-        of_lens = float(self.lens_information * state.lens @ state.lens)
-        return Linearised(state, r, J, to_camera, J_odometry, chi2, *of_cameras, *of_markers, of_lens)
+        of_common = float(self.common_information @ state.common**2)
+        return Linearised(state, r, J, to_camera, J_odometry, chi2, *of_cameras, *of_markers, of_common)
 
     def rms_px(self, now: Linearised) -> float:
         """Rms re-projection error of all corners [px]."""
@@ -259,7 +277,8 @@ class MapProblem:
             corners=self.corners[views],
             W=self.W[views],
             images=Images(self.images.whitening[views], self.images.target[views]),
-            J_lens=self.J_lens[views],
+            J_common=self.J_common[views],
+            J_readout=self.J_readout[views],
         )
 
     def spread(self, most: int) -> BoolArray:
@@ -285,14 +304,14 @@ class MapProblem:
 
     def normal(self, now: Linearised, scale: float) -> tuple[Blocks, Vectors]:
         """Normal equations, and their right sides."""
-        weights, count = now.weights(scale)[:, None, None], self.J_lens.shape[-1]
-        # What the poses' derivatives are multiplied with beside each other: the lens's, and the residuals.
-        beside = np.concatenate([self.J_lens, now.r[..., None]], axis=-1)
+        weights, count = now.weights(scale)[:, None, None], self.J_common.shape[-1]
+        # What the poses' derivatives are multiplied with beside each other: those by what views share, and residuals.
+        beside = np.concatenate([self.J_common, now.r[..., None]], axis=-1)
         of_marker = weights * np.swapaxes(now.J, -1, -2)
         node, by_marker = of_marker @ now.J, of_marker @ beside
         cross = now.to_camera @ node
         of_frames, of_markers = self.over_frames(now.to_camera @ by_marker), self.over_markers(by_marker)
-        of_lens = np.tensordot(weights * self.J_lens, beside, axes=([0, 1], [0, 1]))
+        of_common = np.tensordot(weights * self.J_common, beside, axes=([0, 1], [0, 1]))
         odometry, known = self.odometry.weighted(now.camera_chi2), self.known.weighted(now.marker_chi2)
         by_odometry, back = odometry @ now.J_odometry, np.swapaxes(now.J_odometry, -1, -2)
         blocks = Blocks(
@@ -302,7 +321,7 @@ class MapProblem:
             common=Vectors(
                 of_frames[..., :-1],
                 _with_odometry(of_markers[..., :-1], np.zeros((1, 6, count))),
-                of_lens[:, :-1] + self.lens_information * np.eye(count),
+                of_common[:, :-1] + np.diag(self.common_information),
             ),
         )
         of_odometry = odometry @ now.camera_apart[..., None]
@@ -310,7 +329,7 @@ class MapProblem:
         return blocks, Vectors(
             of_frames[..., -1:] + of_odometry,
             _with_odometry(of_markers[..., -1:] + of_known, -back @ of_odometry),
-            of_lens[:, -1:] - self.lens_information * now.state.lens[:, None],
+            of_common[:, -1:] - (self.common_information * now.state.common)[:, None],
         )
 
     def over_frames(self, values: FloatArray) -> FloatArray:

@@ -10,10 +10,11 @@ A pure function on a snapshot: it may run in another thread or process while the
 """
 
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import noise_factor
+from thermal_fiducial.core.error_model import noise_factor, READOUT_STD
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import retract
 from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
@@ -21,6 +22,7 @@ from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProb
 from thermal_fiducial.core.mapping.candidates import MAX_VIEWS, UNAMBIGUOUS
 from thermal_fiducial.core.mapping.error_sources import ErrorSources
 from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.mapping.undeclared_readout import CONTRADICTS, FoundReadout
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
 MAX_ITERATIONS = 25
@@ -64,6 +66,8 @@ class AdjustedMap:
     inconsistent: dict[int, float]
     map_revision: int
     aspect: FoundAspect
+    #: what the readout time is declared too short by; None while nothing is contradicted
+    readout: FoundReadout | None = None
 
 
 def refine(snapshot: Snapshot) -> AdjustedMap | None:
@@ -72,12 +76,36 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
     if problem is None:
         return None
     now = problem.evaluate(problem.start)
-    if problem.J_lens.any():
+    if problem.J_common.any():
         problem = _weighed(problem, snapshot, now)
     now = _minimise(problem, now)
     mirrored = _with_mirrored(problem, now)
     now = now if mirrored is None else _minimise(problem, mirrored)
+    if snapshot.readout or _contradicts_readout(problem, snapshot, now):
+        problem = problem.with_readout()
+        now = _minimise(problem, problem.evaluate(_with_readout(now.state)))
     return _result(problem, snapshot, now)
+
+
+def _contradicts_readout(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> bool:
+    """Whether the views show another readout time than the declared one, by a step from the solution by that."""
+    if not problem.J_readout.any():
+        return False
+    problem = problem.with_readout()
+    now = problem.evaluate(_with_readout(now.state))
+    widened, sources = _sources(problem, now)
+    if sources is None:
+        return False
+    step = sources.system.solve(sources.problem.normal(now, _scale(now.chi2))[1]).common[-1, 0]
+    by_noise = FoundReadout(READOUT_STD * step, READOUT_STD * math.sqrt(widened * sources.noise_of_common[-1, -1]))
+    if by_noise.sigmas < CONTRADICTS:
+        return False
+    std = math.sqrt(sources.variance_of_common(-1, widened, snapshot.errors))
+    return FoundReadout(READOUT_STD * step, READOUT_STD * std).sigmas > CONTRADICTS
+
+
+def _with_readout(state: Poses) -> Poses:
+    return replace(state, common=np.append(state.common, 0.0))
 
 
 def _sources(problem: MapProblem, now: Linearised) -> tuple[float, ErrorSources | None]:
@@ -104,10 +132,11 @@ def _weighed(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> MapPro
     widened, sources = _sources(problem, now)
     if sources is None:
         return problem
-    shown = 1.0 / sources.system.covariance[0, 0] - problem.lens_information
-    gain = shown / (shown + problem.lens_information)
-    best = min(gain**2 / max(sources.variance_of_aspect(widened, snapshot.errors), TINY), 1.0 - TINY)
-    return replace(problem, lens_information=shown * (1.0 / best - 1.0)) if best > TINY else problem
+    prior = float(problem.common_information[0])
+    shown = 1.0 / sources.system.covariance[0, 0] - prior
+    gain = shown / (shown + prior)
+    best = min(gain**2 / max(sources.variance_of_common(0, widened, snapshot.errors), TINY), 1.0 - TINY)
+    return replace(problem, common_information=np.array([shown * (1.0 / best - 1.0)])) if best > TINY else problem
 
 
 def _minimise(problem: MapProblem, now: Linearised) -> Linearised:
@@ -193,7 +222,7 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
         return None
     full = sources.weights == 1.0
     known = np.stack([snapshot.markers[key].draws for key in problem.ids])
-    covariances, draws, left = sources.of_markers(widened, snapshot.errors, known)
+    covariances, draws, left, common = sources.of_markers(widened, snapshot.errors, known)
     if not np.all(np.isfinite(covariances)):
         return None
     markers, inconsistent = {}, {}
@@ -215,8 +244,17 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
         now.cost(_scale(now.chi2)) / widened,
         inconsistent,
         snapshot.map_revision,
-        FoundAspect(problem.camera, float(now.state.lens[0]), left),
+        FoundAspect(problem.camera, float(now.state.common[0]), left),
+        _readout(now.state, common, snapshot.readout),
     )
+
+
+def _readout(state: Poses, common: FloatArray, known: float) -> FoundReadout | None:
+    """What was found of the readout time, beside what was ``known`` [s] of it."""
+    if len(state.common) < 2:
+        return None
+    std = READOUT_STD * math.sqrt(float(np.mean(common[-1] ** 2)))
+    return FoundReadout(known + READOUT_STD * float(state.common[-1]), std)
 
 
 def two_places(residuals: FloatArray, J: FloatArray, outlying: BoolArray) -> bool:

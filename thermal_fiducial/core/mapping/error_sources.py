@@ -33,6 +33,8 @@ class MapErrors(NamedTuple):
     draws: FloatArray
     #: (K,) draws of what is left of the aspect ratio's error, as a share of the declared one
     aspect_left: FloatArray
+    #: (L, K) draws of the errors of what was estimated that all views have in common
+    common: FloatArray
 
 
 @dataclass(frozen=True)
@@ -57,31 +59,35 @@ class ErrorSources:
         system, problem, positions = self.system, self.problem, self.now.state.T_map_marker[:, :3, 3]
         by_corners = system.solve(self._lasting(errors))
         by_held = system.by_held(np.concatenate([known, np.zeros_like(known[:1])]))
-        common = covariance_root(self._noise_of_common) @ self.rng.standard_normal((len(by_corners.common), DRAWS))
+        common = covariance_root(self.noise_of_common) @ self.rng.standard_normal((len(by_corners.common), DRAWS))
         by_noise = np.sqrt(widened) * system.drawn(common, self.rng)
-        covariances = widened * system.covariances(self._noise_of_common)[:-1]
+        covariances = widened * system.covariances(self.noise_of_common)[:-1]
         covariances += covariance_by_draws(by_corners.nodes[:-1]) + covariance_by_draws(by_held.nodes[:-1])
         covariances += scale_of_map(arms_of_scale(positions, positions[problem.anchors]), errors)
         draws = by_corners.nodes + by_noise + by_held.nodes
         found = by_corners.common + np.sqrt(widened) * common + by_held.common
         aspect = LensErrors(problem.corners[:1], problem.camera, errors).aspect_draws
-        return MapErrors(covariances, draws[:-1], aspect - found[0])
+        return MapErrors(covariances, draws[:-1], aspect - found[0], found)
 
-    def variance_of_aspect(self, widened: float, errors: SystematicErrors) -> float:
-        """Of what is estimated of the aspect ratio's error, by itself, noise and all other errors."""
-        problem, now, moved = self.problem, self.now, self.system.moved
+    def variance_of_common(self, index: int, widened: float, errors: SystematicErrors) -> float:
+        """Of what is estimated of one of the L errors that all views have in common, by noise and all other errors.
+
+        The error of the aspect ratio is among these.
+        """
+        problem, now, moved, covariance = self.problem, self.now, self.system.moved, self.system.covariance
         of_cameras = np.swapaxes(now.to_camera, -1, -2) @ moved.frames[problem.frame]
-        gains = self._by_corners(problem.J_lens - now.J @ (moved.nodes[problem.marker] + of_cameras))
+        by_common = problem.J_common - now.J @ (moved.nodes[problem.marker] + of_cameras)
+        gains = self._by_corners(by_common @ (covariance[:, index, None] / covariance[index, index]))
         of_shapes = np.sum(problem.over_markers(gains) ** 2, axis=(1, 2, 3)) @ self._shapes(errors) ** 2
         of_lens = LensErrors(problem.corners, problem.camera, errors).covariance(gains.reshape(-1, 1, 2)).item()
-        noise = widened * self._noise_of_common[0, 0]
-        return float(self.system.covariance[0, 0] ** 2 * (of_shapes + of_lens) + noise)
+        noise = widened * self.noise_of_common[index, index]
+        return float(covariance[index, index] ** 2 * (of_shapes + of_lens) + noise)
 
     @property
-    def _noise_of_common(self) -> FloatArray:
+    def noise_of_common(self) -> FloatArray:
         """Covariance (L, L) by noise alone: the error of the aspect ratio is among the lasting ones."""
         covariance = self.system.covariance
-        return np.asarray(covariance - self.problem.lens_information * covariance @ covariance)
+        return np.asarray(covariance - self.problem.common_information * covariance @ covariance)
 
     def _lasting(self, errors: SystematicErrors) -> Vectors:
         """Right sides by corner errors that are the same in all views of a marker, and by those of the lens.
@@ -92,7 +98,7 @@ class ErrorSources:
         problem, now = self.problem, self.now
         shapes = self._shapes(errors)[:, None, None] * self.rng.standard_normal((len(problem.ids), 8, DRAWS))
         # What is common has its part of each keyframe's views, too.
-        J_frame = np.concatenate([now.J @ np.swapaxes(now.to_camera, -1, -2), problem.J_lens], axis=-1)
+        J_frame = np.concatenate([now.J @ np.swapaxes(now.to_camera, -1, -2), problem.J_common], axis=-1)
         of_frames, of_markers = self._by_corners(J_frame), self._by_corners(now.J)
         frames = self._by_lens(of_frames, problem.frame, len(problem.stamps), errors)
         nodes = self._by_lens(of_markers, problem.marker, len(problem.ids), errors)

@@ -17,6 +17,7 @@ from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
+from thermal_fiducial.core.mapping.undeclared_readout import rates_of_rows
 from thermal_fiducial.core.measurements import CameraPose, Observations
 from thermal_fiducial.core.motion_prior import displacement_covariance, PredictedCamera
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
@@ -27,6 +28,8 @@ _CELL = 0.25
 _THINNED = 0.85
 # A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
 _GROWTH, _FEW = 0.2, 15
+# Velocity of a frame, in its standard deviations, from which on it says where rows that are read late are.
+_SURE = 3.0
 #: Views of markers that a refinement in flight takes: half a second or one of a slow core.
 VIEWS = 10_000
 # Time between two refinements for each view of the last [s]: a view takes a fifth of it on a slow core. With three
@@ -51,6 +54,8 @@ class Keyframe:
     information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     #: whether only odometry connects it, and markers that follow, with keyframes before: never dropped
     bridge: bool = False
+    #: (k, 4, 2) [px/s] what corners are displaced by each second that the readout time is declared too short by
+    rates: FloatArray = field(default_factory=lambda: np.zeros((1, 1, 1)))
 
 
 def snapshot_of(
@@ -60,6 +65,7 @@ def snapshot_of(
     known: Mapping[int, tuple[FloatArray, FloatArray]],
     map_revision: int,
     errors: SystematicErrors,
+    readout: float = 0.0,
 ) -> Snapshot:
     """At least one keyframe, and ``markers`` of the map to adjust, as a refinement works on them."""
     information = np.stack([frame.information for frame in frames])
@@ -74,9 +80,11 @@ def snapshot_of(
         np.concatenate([frame.ids for frame in frames]),
         np.concatenate([frame.corners for frame in frames]),
         np.concatenate([frame.covariances for frame in frames]),
+        np.concatenate([np.broadcast_to(frame.rates, frame.corners.shape) for frame in frames]),
         known,
         map_revision,
         errors,
+        readout,
     )
 
 
@@ -200,8 +208,11 @@ class KeyframeStore:
         """Whether keyframes have come since the last adjustment was begun."""
         return self._added > self._adjustment.added
 
-    def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int) -> Snapshot | None:
-        """Input of an adjustment, with about ``views`` views of markers at most; None without keyframes."""
+    def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int, readout: float) -> Snapshot | None:
+        """Input of an adjustment, with about ``views`` views of markers at most; None without keyframes.
+
+        ``readout`` : what the readout time is known to be declared too short by [s]
+        """
         if not self.frames or self._camera is None:
             return None
         markers = len(marker_map.markers)
@@ -211,7 +222,7 @@ class KeyframeStore:
         trusted = {key: marker for key, marker in marker_map.markers.items() if marker.trusted}
         observed_ids = set(np.concatenate([frame.ids for frame in frames]).tolist())
         priors = prior_poses({key: marker for key, marker in self._before.items() if key in observed_ids})
-        return snapshot_of(trusted, frames, self._camera, priors, marker_map.revision, errors)
+        return snapshot_of(trusted, frames, self._camera, priors, marker_map.revision, errors, readout)
 
     def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
         """Take over adjusted poses by stamp; other keyframes move with the nearest adjusted one in time."""
@@ -237,7 +248,8 @@ class KeyframeStore:
         if predicted is None:
             return frame
         information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
-        return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
+        rates = _sure(*rates_of_rows(observed, camera, predicted))
+        return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information, rates=rates)
 
     def _carry_over(self, before: Camera, now: Camera) -> None:
         """Give all keyframes the pixels that their directions have by another calibration."""
@@ -279,6 +291,12 @@ class KeyframeStore:
         for stamp, key in zip(self.frames, np.rint(scaled).astype(int).tolist(), strict=True):
             cells[tuple(key)].append(stamp)
         return cells
+
+
+def _sure(rates: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Rates (k, 4, 2) of a frame, zero where odometry does not know its velocity."""
+    known = np.sum(rates**2) > _SURE**2 * np.trace(covariances, axis1=-2, axis2=-1).sum()
+    return rates if known else np.zeros_like(rates)
 
 
 def _rigid(T: FloatArray) -> FloatArray:

@@ -125,9 +125,9 @@ class MarkerMapper:
     def locate(self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None) -> LocatedFrame:
         """First half of :meth:`process`, up to the pose, which can be published before the map is updated."""
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
-        raw = self.readout.corrected(Observations.of(markers), camera, predicted)
-        errors = self._errors_of(camera)
-        observed = replace(raw, corners=without_found_aspect(raw.corners, camera, errors))
+        raw, errors = Observations.of(markers), self._errors_of(camera)
+        observed = self.readout.corrected(raw, camera, predicted)
+        observed = replace(observed, corners=without_found_aspect(observed.corners, camera, errors))
         # Step 2: known and new markers.
         is_known, known = self._in_map(observed)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
@@ -270,7 +270,7 @@ class MarkerMapper:
         ----------
         views : approximate largest number of views of markers, which bounds the time
         """
-        return self._keyframes.snapshot(self.map, self.errors, views)
+        return self._keyframes.snapshot(self.map, self.errors, views, self.readout.seconds)
 
     def refine(self, views: int = sys.maxsize) -> AdjustedMap | None:
         """Run a bundle adjustment here, of so many ``views`` as :meth:`snapshot` takes, and apply it."""
@@ -291,6 +291,7 @@ class MarkerMapper:
             return False
         self.map.adjust(refinement.markers)
         self._found = refinement.aspect
+        self.readout.adopt(refinement.readout)
         self._consistency.flag(self.map.markers, refinement.inconsistent)
         self._new.move(self._keyframes.move(refinement.keyframes))
         self.resets += 1

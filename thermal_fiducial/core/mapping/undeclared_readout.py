@@ -1,11 +1,12 @@
-"""A rolling shutter whose rows are read over another time than ``readout_time`` says, found in flight.
+"""A rolling shutter whose rows are read over another time than ``readout_time`` says, found in flight by its frames.
 
 The detector moves corners to the stamp by the declared time. If that is too short by d, a corner at the share s of the
 rows, -1/2 in the first one and 1/2 in the last, stays displaced by d s times its velocity in the image. The pose of the
-frame takes up a part of that; what it leaves, in all frames, shows d by least squares.
+frame takes up a part of that; what it leaves, in all frames, shows d by least squares. Where the map is made in the
+same flight, its adjustment has d among its unknowns, and knows better.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
@@ -28,9 +29,24 @@ from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.types import FloatArray, TINY
 
-# Standard deviations by which the time must be off before corners are corrected by it, and before residuals count as of
-# it, not of an error of the lens. In flights as declared it is up to 1.2, over recorded carpets up to 1.7.
-_CONTRADICTS, _LIKELY = 4.0, 1.0
+#: Standard deviations by which the time must be off before corners are corrected by it. In flights as declared it is up
+#: to 1.7.
+CONTRADICTS = 4.0
+# And before residuals count as of it, not of an error of the lens.
+_LIKELY = 1.0
+
+
+@dataclass(frozen=True)
+class FoundReadout:
+    """What the readout time is declared too short by, and its standard deviation [s]."""
+
+    seconds: float
+    std: float
+
+    @property
+    def sigmas(self) -> float:
+        """By how many standard deviations it contradicts the declaration."""
+        return abs(self.seconds) / math.hypot(self.std, READOUT_AS_DECLARED)
 
 
 class UndeclaredReadout:
@@ -45,18 +61,16 @@ class UndeclaredReadout:
         # seconds, and its joint draws by errors of lens and map, which last as long as the flight.
         self._information, self._weighted, self._variance = 0.0, 0.0, 0.0
         self._common: FloatArray = np.zeros(DRAWS)
+        # What the last adjustment of the map has found.
+        self._by_map: FoundReadout | None = None
 
     def corrected(self, observed: Observations, camera: Camera, predicted: PredictedCamera | None) -> Observations:
         """The corners of N markers at the stamp, without what the time displaces them by in a camera in motion."""
         if predicted is None or self.seconds == 0.0:
             return observed
-        at, R = ImagePoints.at(observed.corners, camera), predicted.pose.T_map_camera[:3, :3]
-        depth = np.repeat(observed.branches[:, :1, 2, 3], 4, axis=1)
-        late = self.seconds * camera.readout_shares(observed.corners[..., 1])[..., None, None]
-        by_twist = late * (at.J @ interaction(at.x, depth))
-        moved = by_twist @ (turn_of_pose(R.T) @ predicted.velocity)
-        unsure = by_twist @ turned(predicted.velocity_covariance(1.0), R.T) @ by_twist.swapaxes(-1, -2)
-        return replace(observed, corners=observed.corners - moved, covariances=observed.covariances + unsure)
+        rates, unsure = rates_of_rows(observed, camera, predicted)
+        corners = observed.corners - self.seconds * rates
+        return replace(observed, corners=corners, covariances=observed.covariances + self.seconds**2 * unsure)
 
     def claimed(self, location: Location, camera: Camera, predicted: PredictedCamera | None) -> Location:
         """The location, whose covariance has what is not known of the time."""
@@ -75,7 +89,7 @@ class UndeclaredReadout:
 
     def add(self, location: Location, camera: Camera, predicted: PredictedCamera | None) -> None:
         """Update with the residuals of a frame that was corrected by the time as known so far."""
-        if predicted is None:
+        if predicted is None or self._by_map is not None:
             return
         sight, fit = location.sight, location.reprojection
         W, shares = whitening(sight.observed.covariances), camera.readout_shares(sight.observed.corners[..., 1])
@@ -103,16 +117,29 @@ class UndeclaredReadout:
         self._common += weight * common
         self._judge()
 
+    def adopt(self, found: FoundReadout | None) -> None:
+        """Take over what an adjustment of the map has found, if anything; frames alone know less of it.
+
+        They see the map as it is, and one that was made by displaced corners has taken up a part of the time.
+        """
+        if found is not None:
+            self._by_map = found if found.sigmas > CONTRADICTS else None
+            self._judge()
+
     def _judge(self) -> None:
         """Take the time over where it is beyond doubt."""
+        if self._by_map is not None:
+            self._likely = self.seconds = self._by_map.seconds
+            self.std = math.hypot(self._by_map.std, HIDDEN_OF_READOUT * self.seconds)
+            return
         information = max(self._information, TINY)
         variance = (self._variance + float(np.mean(self._common**2))) / information**2
         share = READOUT_STD**2 / (READOUT_STD**2 + variance)
         seconds, std = share * self._weighted / information, math.sqrt(share * variance)
-        sigmas = abs(seconds) / math.hypot(std, READOUT_AS_DECLARED)
-        self._likely = seconds if sigmas > _LIKELY else 0.0
+        found = FoundReadout(seconds, std)
+        self._likely = seconds if found.sigmas > _LIKELY else 0.0
         self.seconds, self.std = 0.0, 0.0
-        if sigmas > _CONTRADICTS:
+        if found.sigmas > CONTRADICTS:
             self.seconds, self.std = seconds, math.hypot(std, HIDDEN_OF_READOUT * seconds)
 
     @property
@@ -123,6 +150,16 @@ class UndeclaredReadout:
         off, std = 1e3 * abs(self.seconds), 1e3 * self.std
         more, add = ('more', 'add') if self.seconds > 0.0 else ('less', 'subtract')
         return f'rows are read over {off:.1f} +- {std:.1f} ms {more} than readout_time says: {add} {1e-3 * off:.4f}'
+
+
+def rates_of_rows(observed: Observations, camera: Camera, predicted: PredictedCamera) -> tuple[FloatArray, FloatArray]:
+    """Displacement (N, 4, 2) of the corners of N markers by each second of the time [px/s], and its covariances."""
+    at, R = ImagePoints.at(observed.corners, camera), predicted.pose.T_map_camera[:3, :3]
+    depth = np.repeat(observed.branches[:, :1, 2, 3], 4, axis=1)
+    shares = camera.readout_shares(observed.corners[..., 1])[..., None, None]
+    by_twist = shares * (at.J @ interaction(at.x, depth))
+    moved = by_twist @ (turn_of_pose(R.T) @ predicted.velocity)
+    return moved, by_twist @ turned(predicted.velocity_covariance(1.0), R.T) @ by_twist.swapaxes(-1, -2)
 
 
 def _without(Q: FloatArray, errors: FloatArray) -> FloatArray:
