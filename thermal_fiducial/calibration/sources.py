@@ -17,7 +17,7 @@ from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.images import image_to_array, PICTURE_SUFFIXES, pictures_in, stamp_to_ns
 from thermal_fiducial.files.reading import naming
-from thermal_fiducial.files.recordings import imu_samples
+from thermal_fiducial.files.recordings import check_units, imu_samples
 
 #: Columns of a file of measured points; a header may hold more.
 POINT_COLUMNS = ('view', 'point', 'u', 'v', 'x', 'y')
@@ -123,7 +123,7 @@ def imu_track(bag: BagReader) -> tuple[ImuTrack, int]:
     Raises
     ------
     InputError
-        No topic of IMU samples, or invalid samples.
+        No topic of IMU samples, or samples that are invalid or most likely in other units.
     """
     bag.require({IMU_TOPIC: _IMU_TYPE})
     stamps, values = [], []
@@ -132,7 +132,10 @@ def imu_track(bag: BagReader) -> tuple[ImuTrack, int]:
         stamps.append(stamp_to_ns(message.header.stamp))
         rate, force = message.angular_velocity, message.linear_acceleration
         values.append((rate.x, rate.y, rate.z, force.x, force.y, force.z))
-    return _in_order(bag.path, stamps, np.array(values, dtype=np.float64))
+    samples = np.array(values, dtype=np.float64)
+    track = _in_order(bag.path, stamps, samples)
+    check_units(bag.path, np.array(stamps, dtype=np.int64), samples)
+    return track
 
 
 def imu_track_of_csv(path: Path) -> ImuTrack:

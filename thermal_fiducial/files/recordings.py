@@ -35,8 +35,9 @@ _NORM_TOLERANCE = 0.01
 _LATEST_NS = 2**31 * SECOND_NS
 #: Limit of corners [px]: they may lie outside the picture, but within this range.
 _FARTHEST_CORNER = 1e5
-#: Plausible IMU samples: period [s], specific force at rest [g], largest turn rate [rad/s].
-_STEPS_S, _IN_G, _FAST = (2e-5, 1.0), (0.8, 1.2), 35.0
+#: Plausible IMU samples: period [s], median of the specific force [m/s^2], largest turn rate [rad/s]. No flight takes
+#: half of gravity away for most of the time, or shakes by ten times as much.
+_STEPS_S, _FORCES, _FAST = (2e-5, 1.0), (4.9, 98.0), 35.0
 
 
 @dataclass(frozen=True)
@@ -223,17 +224,18 @@ def imu_samples(path: Path) -> list[ImuSample]:
         Unreadable, no such columns, or most likely in other units; the message names file and line.
     """
     stamps, values = _table(path, 7, lambda row: is_imu_reading(row[:3], row[3:6]))
-    _check_units(path, stamps, values)
+    check_units(path, stamps, values)
     return [ImuSample(int(stamp), row[:3], row[3:6]) for stamp, row in zip(stamps, values, strict=True)]
 
 
-def _check_units(path: Path, stamps: IntArray, values: FloatArray) -> None:
-    """Raise InputError for stamps, turn rates or specific forces that are most likely in another unit."""
+def check_units(path: Path, stamps: IntArray, values: FloatArray) -> None:
+    """Raise InputError for stamps (N,), turn rates and forces (N, 6) most likely in another unit or without gravity."""
     step = float(np.median(np.diff(np.sort(stamps)))) / SECOND_NS if len(stamps) > 1 else _STEPS_S[1]
     if not _STEPS_S[0] <= step <= _STEPS_S[1]:
         raise InputError(f'{path}: samples {step:.3g} s apart: are the stamps in nanoseconds?')
-    if _IN_G[0] < (force := float(np.median(np.linalg.norm(values[:, 3:6], axis=1)))) < _IN_G[1]:
-        raise InputError(f'{path}: accelerations of {force:.2f} m/s^2 on average: are they in g?')
+    if not _FORCES[0] < (force := float(np.median(np.linalg.norm(values[:, 3:6], axis=1)))) < _FORCES[1]:
+        mean = f'accelerations of {force:.2f} m/s^2 on average, gravity makes them 9.8'
+        raise InputError(f'{path}: {mean}: are they in g, or without gravity?')
     if (turn := float(np.percentile(np.linalg.norm(values[:, :3], axis=1), 90))) > _FAST:
         raise InputError(f'{path}: a tenth of the turn rates above {turn:.0f} rad/s: are they in degrees a second?')
 

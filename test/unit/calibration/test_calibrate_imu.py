@@ -115,7 +115,22 @@ def test_what_is_no_rest_is_refused(change, words):
 
 def test_the_command_names_the_recording_that_it_refuses(tmp_path, capsys):
     stamps = small_bag.START_NS + np.arange(200) * 5_000_000
-    events = [(stamp, IMU_TOPIC, small_bag.imu(stamp, np.zeros(6))) for stamp in stamps.tolist()]
+    at_rest = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.8])
+    events = [(stamp, IMU_TOPIC, small_bag.imu(stamp, at_rest)) for stamp in stamps.tolist()]
     bag = small_bag.Recording(events).write(tmp_path / 'bag')
     assert main(['calibrate', 'imu', str(bag), '--out', str(tmp_path / 'imu.yaml')]) == 2
     assert f'{bag}: 1.0 s are too short' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('force', [1.0, 0.0, 9806.65])
+def test_accelerations_of_a_bag_are_metres_a_second_squared_with_gravity(tmp_path, capsys, force):
+    """A CSV file in g was refused; of a bag in g, or in a thousandth of it, the densities were wrong without a word."""
+    times, values = at_rest(25.0)
+    values[:, 3:] *= force / 9.8
+    stamps = small_bag.START_NS + np.round(times * 1e9).astype(np.int64)
+    rows = zip(stamps.tolist(), values, strict=True)
+    bag = small_bag.Recording([(stamp, IMU_TOPIC, small_bag.imu(stamp, row)) for stamp, row in rows])
+    out = tmp_path / 'imu.yaml'
+    assert main(['calibrate', 'imu', str(bag.write(tmp_path / 'bag')), '--out', str(out)]) == 2
+    assert 'm/s^2 on average, gravity makes them 9.8' in capsys.readouterr().err
+    assert not out.exists()
