@@ -16,7 +16,7 @@ from itertools import compress
 import numpy as np
 
 from thermal_fiducial.calibration.batch_adjustment import Problem, root_information, Solution
-from thermal_fiducial.calibration.preintegration import AXES, Densities, ImuTrack
+from thermal_fiducial.calibration.preintegration import AXES, Densities, GYROSCOPE_AXES, ImuTrack
 from thermal_fiducial.calibration.rig_state import first_state, LARGEST_OFFSET, State
 from thermal_fiducial.calibration.rolling import FrameCorners, RowMoments, SolvedFrame
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
@@ -33,6 +33,8 @@ _SIGNIFICANT = 3.0
 # Re-projection error [px] of most frames beyond which the map is wrong: a read-out of 16 ms that is not known yet
 # bends an image by as much at 100 deg/s, most of which a pose takes up.
 _MISFIT_PX = 20.0
+# Scale errors and misalignments of an IMU beyond which it and the camera contradict each other: ten times the usual.
+_OFF_AXES = 0.1
 # Corners are moved to the middle row's time and poses solved again until read-out time and jitter converge [s].
 _ROUNDS, _SETTLED = 8, 2e-5
 
@@ -89,7 +91,8 @@ def calibrate_camera_imu(
     Raises
     ------
     InputError
-        Too few poses, no IMU samples around them, or motion that the answer cannot be read from.
+        Too few poses, no IMU samples around them, motion that the answer cannot be read from, or samples of another
+        motion.
     """
     recording = _RigRecording(imu, start_ns)
     poses = list(compress(poses, recording.covers(poses)))
@@ -259,7 +262,16 @@ class _RigRecording:
 
 
 def _answer(solution: Solution, readout_sigma: float) -> CameraImuCalibration:
+    """The result; raises InputError where only an IMU that none is explains what the camera shows."""
     state = solution.state
+    worst = int(np.argmax(np.abs(state.axes)))
+    if abs(state.axes[worst]) > _OFF_AXES:
+        sensor = 'gyroscope' if worst < GYROSCOPE_AXES else 'accelerometer'
+        raise InputError(
+            f'IMU and camera contradict each other, the {sensor} by {100.0 * abs(state.axes[worst]):.0f} %: axes, sign '
+            'and units of the IMU, two IMUs on its topic, sides and places of the map, the lens, clocks that are more '
+            f'than {LARGEST_OFFSET:g} s apart?'
+        )
     return CameraImuCalibration(
         se3.transform(state.R_body_camera, state.p_body_camera),
         state.offset,

@@ -17,8 +17,8 @@ from thermal_fiducial.core.types import FloatArray
 
 # Longest step of the integration [s]: the sampling interval of a 200 Hz IMU.
 _STEP = 0.005
-#: Number of scale errors and misalignments of an IMU.
-AXES = 15
+#: Number of scale errors and misalignments of an IMU, and of those of its gyroscope, which are the first.
+AXES, GYROSCOPE_AXES = 15, 9
 # Variance of the second difference of white noise of variance one.
 _SECOND_DIFFERENCE = 6.0
 
@@ -95,7 +95,7 @@ def axis_errors(rate: FloatArray, force: FloatArray) -> FloatArray:
     J = np.zeros((len(rate), 6, AXES))
     for row in range(3):
         J[:, row, 3 * row : 3 * row + 3] = rate
-        first = 9 + row * (row + 1) // 2
+        first = GYROSCOPE_AXES + row * (row + 1) // 2
         J[:, 3 + row, first : first + row + 1] = force[:, : row + 1]
     return J
 

@@ -258,6 +258,30 @@ def test_unusable_recordings_are_refused():
         calibrate_camera_imu(still, imu, START_NS, IMU)
 
 
+def _with_another(imu):
+    """A second IMU on the same topic, turned by 90 degrees, whose samples come 1 ms later."""
+    turned = [np.stack([signal, signal[:, [1, 0, 2]] * [1.0, -1.0, 1.0]], axis=1) for signal in (imu.rate, imu.force)]
+    seconds = imu.seconds[:, None] + np.array([0.0, 0.001])
+    return ImuTrack(seconds.ravel(), *(signal.reshape(-1, 3) for signal in turned))
+
+
+@pytest.mark.parametrize(
+    ('change', 'sensor'),
+    [
+        (lambda imu: replace(imu, rate=np.degrees(imu.rate)), 'gyroscope'),
+        (lambda imu: replace(imu, rate=-imu.rate), 'accelerometer'),
+        (lambda imu: replace(imu, rate=imu.rate * [-1.0, 1.0, 1.0]), 'gyroscope'),
+        (lambda imu: replace(imu, force=-imu.force), 'accelerometer'),
+        (_with_another, 'gyroscope'),
+    ],
+)
+def test_an_imu_that_contradicts_the_camera_is_refused(change, sensor):
+    """A camera that is metres from the IMU was written, with the advice to record a minute."""
+    poses, imu = recording(SCENARIO, 20.0, 1)
+    with pytest.raises(InputError, match=f'contradict each other, the {sensor} by .*sign and units of the IMU'):
+        calibrate_camera_imu(poses[::4], change(imu), START_NS, IMU)
+
+
 # --- rolling read-out ---------------------------------------------------------------------------------
 
 READOUT = 0.016
