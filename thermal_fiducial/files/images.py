@@ -26,6 +26,9 @@ _LARGEST_FILE_BYTES = 250_000_000
 _STAMP_END = 12
 #: Magic bytes of lossless formats: PNG, and TIFF of either byte order.
 _LOSSLESS = (b'\x89PNG', b'II*\0', b'MM\0*')
+# How many times as large steps between neighbours are where bytes are swapped: 256, else a 256th, and 1 in noise. Rows
+# that are so far apart show it.
+_ROUGHER, _ROW_STEP = 16.0, 64
 
 
 def image_to_array(message: Any) -> Counts | Gray:
@@ -39,7 +42,7 @@ def image_to_array(message: Any) -> Counts | Gray:
     Raises
     ------
     InputError
-        An encoding other than 8 or 16 bit mono, sizes that contradict the data, or a lossy compression.
+        An encoding other than 8 or 16 bit mono, sizes or bytes that contradict the data, or a lossy compression.
     """
     if hasattr(message, 'format'):
         return _decompressed(message)
@@ -55,7 +58,21 @@ def image_to_array(message: Any) -> Counts | Gray:
         )
     kind = f'{">" if message.is_bigendian else "<"}u{itemsize}'
     pixels: npt.NDArray[Any] = np.ndarray((height, width), kind, message.data, strides=(step, itemsize))
-    return np.ascontiguousarray(pixels, f'u{itemsize}')
+    counts: Counts | Gray = np.ascontiguousarray(pixels, f'u{itemsize}')
+    if itemsize == 2 and _is_swapped(counts):
+        right = int(not message.is_bigendian)
+        raise InputError(f'image {message.encoding} with swapped bytes: its driver must set is_bigendian to {right}')
+    return counts
+
+
+def _is_swapped(counts: npt.NDArray[Any]) -> bool:
+    """Whether neighbours among 16-bit ``counts`` (H, W) are alike once the bytes of each are swapped, and only then."""
+    rows = counts[::_ROW_STEP]
+    # Most of them without a low byte are 8 bits, left-aligned.
+    if rows.shape[1] < 2 or 2 * np.count_nonzero(rows & 0xFF) < rows.size:
+        return False
+    as_is, swapped = (np.percentile(cv2.absdiff(a[:, 1:], a[:, :-1]), 75.0) for a in (rows, rows.byteswap()))
+    return bool(as_is > _ROUGHER * swapped)
 
 
 def _decompressed(message: Any) -> Counts | Gray:

@@ -35,6 +35,22 @@ def test_any_byte_order_and_row_step(big, padding, encoding):
     assert pixels.dtype == np.uint16
 
 
+@pytest.mark.parametrize('big', [0, 1])
+def test_bytes_in_another_order_than_is_announced_are_named(big):
+    """Markers were found in such images, and poses were 50 mm off."""
+    rng = np.random.default_rng(1)
+    scene = 7500.0 + 300.0 * np.linspace(0.0, 1.0, 640) + rng.normal(0.0, 4.0, (512, 640))
+    low, order = scene - 7450.0, '>u2' if big else '<u2'
+    # Counts of 14 bits as they are and left-aligned, few of them, 8 bits left-aligned, and noise alone.
+    for counts in (scene, 4.0 * scene, low, 256.0 * np.rint(low / 2.0), rng.uniform(0.0, 65535.0, scene.shape)):
+        pixels = np.rint(counts).astype(np.uint16)
+        image = message(pixels.astype(order).tobytes(), 'mono16', 1280, big, 640, 512)
+        np.testing.assert_array_equal(image_to_array(image), pixels)
+    image = message(np.rint(scene).astype(order).tobytes(), 'mono16', 1280, 1 - big, 640, 512)
+    with pytest.raises(InputError, match=f'swapped bytes: its driver must set is_bigendian to {big}'):
+        image_to_array(image)
+
+
 def test_eight_bits_and_a_last_row_without_padding():
     pixels = image_to_array(message(np.arange(8, dtype=np.uint8), 'mono8', 5))
     np.testing.assert_array_equal(pixels, [[0, 1, 2], [5, 6, 7]])
