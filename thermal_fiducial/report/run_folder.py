@@ -128,9 +128,9 @@ def bag_of_run(path: Path, summary: dict[str, Any]) -> Path | None:
     """The bag that a run was replayed from; None if it is not found."""
     known, name = summary.get('bag_path'), summary.get('bag')
     places = [Path(known)] if isinstance(known, str) else []
-    # A run folder may have been moved, with the bag in it or beside it.
+    # A run folder may have been moved, with the bag in it or beside it; the run may have the name of the bag.
     places += [path / name, path.parent / name] if isinstance(name, str) and name else []
-    return next((place for place in places if is_there(place)), None)
+    return next((place for place in places if is_there(place) and not is_there(place / SUMMARY)), None)
 
 
 def bag_options(summary: dict[str, Any]) -> dict[str, Any]:

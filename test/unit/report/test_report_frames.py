@@ -164,6 +164,14 @@ def test_a_bag_beside_a_moved_run_is_found(flight, tmp_path):
     assert bag_of(read_run(tmp_path / 'run')).path == tmp_path / 'bag'
 
 
+def test_a_run_with_the_name_of_its_bag_is_not_taken_for_the_bag(flight, tmp_path):
+    """Without its bag it had no report any more: "no bag, the folder has neither metadata.yaml nor a file .mcap"."""
+    shutil.copytree(flight / 'run', tmp_path / 'monday')
+    summary = json.dumps({'bag': 'monday', 'bag_path': '/nowhere/monday'})
+    (tmp_path / 'monday' / 'summary.json').write_text(summary)
+    assert main(['evaluate', str(tmp_path / 'monday')]) == 0
+
+
 def test_a_recorder_with_another_clock_shows_the_same_frames(flight, tmp_path):
     recording = small_bag.recording(SECONDS)
     late = small_bag.Recording([(stamp + 10**15, topic, message) for stamp, topic, message in recording.events])
