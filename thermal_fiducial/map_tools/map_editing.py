@@ -12,6 +12,10 @@ from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.core.wording import listed, number_of
 from thermal_fiducial.errors import InputError
 
+# Distance of a surveyed marker from its place, as a share of the surveyed part's radius, beyond which the survey
+# contradicts the map: maps by one marker are off by a per cent, an exchanged ID or another unit by much more.
+_CONTRADICTS = 0.1
+
 
 def set_fixed(marker_map: MarkerMap, ids: Iterable[int], fixed: bool) -> MarkerMap:
     """Declare markers fixed (they never move) or free.
@@ -145,7 +149,7 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[M
     Raises
     ------
     InputError
-        Fewer than three surveyed markers in the map, or all collinear.
+        Fewer than three surveyed markers in the map, or all collinear, or in places that contradict the map.
     """
     common = sorted(marker_map.markers.keys() & surveyed.keys())
     if len(common) < 3:
@@ -157,6 +161,12 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[M
         raise InputError('the surveyed markers lie on a line, or in one place: they leave a rotation open')
     T = rigid_alignment(target, source)
     distances = np.linalg.norm(apply(T, source) - target, axis=-1)
+    worst = int(np.argmax(distances))
+    if distances[worst] > _CONTRADICTS * np.linalg.norm(source - source.mean(axis=0), axis=-1).max():
+        raise InputError(
+            f'the survey contradicts the map: marker {common[worst]} would be {distances[worst]:.3g} m from its place '
+            'there: are its numbers metres, its IDs right?'
+        )
     return transformed(marker_map, T), dict(zip(common, distances.tolist(), strict=True))
 
 

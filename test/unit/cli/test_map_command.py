@@ -225,6 +225,24 @@ def test_anchor_moves_the_map_onto_a_survey(path, poses):
 
 
 @pytest.mark.parametrize(
+    ('scale', 'ids'),
+    [
+        # In millimetres; markers 0 and 5 exchanged.
+        (1000.0, (0, 3, 5, 6)),
+        (1.0, (5, 3, 0, 6)),
+    ],
+)
+def test_a_survey_that_contradicts_the_map_is_refused(path, poses, capsys, scale, ids):
+    """The map was written, kilometres away, and with --fix its markers declared surveyed there."""
+    survey, before = path.with_name('survey.csv'), path.read_bytes()
+    places = [scale * poses[key][:3, 3] for key in (0, 3, 5, 6)]
+    survey.write_text(''.join(f'{key},{x},{y},{z}\n' for key, (x, y, z) in zip(ids, places, strict=True)))
+    assert run('anchor', path, survey, '--fix') == 2
+    assert 'survey.csv: the survey contradicts the map: marker ' in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
     ('survey', 'words'),
     [
         ('1,0,0,1\n2,1,0,1\n3,2,0,1\n', 'they leave a rotation open'),
