@@ -1,6 +1,7 @@
 """Markers of a frame: predicted, found, refined, confirmed, both poses of each."""
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -8,12 +9,18 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.detection.confirmation import confirmed
 from thermal_fiducial.core.detection.corners.gray_scale import GrayScale
-from thermal_fiducial.core.detection.corners.refining import refine
+from thermal_fiducial.core.detection.corners.refining import refine, RefinedMarkers
 from thermal_fiducial.core.detection.finding.finder import FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.partial.partial_markers import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, Dictionary
 from thermal_fiducial.core.detection.prediction.frame import Frame
-from thermal_fiducial.core.detection.prediction.known_markers import among, depths, ExpectedMarkers, KnownMarkers
+from thermal_fiducial.core.detection.prediction.known_markers import (
+    among,
+    depths,
+    ExpectedMarkers,
+    FoundMarkers,
+    KnownMarkers,
+)
 from thermal_fiducial.core.detection.prediction.tracking import Guide, MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -92,8 +99,13 @@ class MarkerDetector:
         keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
         frame = Frame.of(stamp_ns, counts, camera, twist, config, keep_columns=keep_columns)
         found, history = self._finder.find(frame, history, known, guide, config)
-        refined, scale = refine(frame, found, history.track, history.gray_scale, self._decoder)
-        refined = confirmed(frame, found, refined, self._decoder, config)
+        refined, scale = self._refined(frame, found, history)
+        if len(found.ids) and not len(refined.ids) and refined.blur.to_tails is not None:
+            # A filter that diverges, as with an IMU in degrees, has motion blur taken out of images that have none.
+            unmoved = replace(frame, twist=None)
+            again, scale_again = self._refined(unmoved, found, history)
+            if len(again.ids):
+                frame, guide, T_camera_map, refined, scale = unmoved, None, None, again, scale_again
         ids, corners, at = refined.ids, refined.corners, refined.places.at
         poses = self._poses(ids, corners.covariances, at, T_camera_map)
         if config.plate_thickness > 0.0:
@@ -108,6 +120,11 @@ class MarkerDetector:
         markers = ExpectedMarkers(ids, refined.places.at.x, depth, corners.contrast / frame.noise)
         self._history = history.after(stamp_ns, twist, markers, scale, saw_partial=len(rows) > len(ids))
         return rows
+
+    def _refined(self, frame: Frame, found: FoundMarkers, history: FrameHistory) -> tuple[RefinedMarkers, GrayScale]:
+        """Those of the markers ``found`` that are confirmed at their refined corners, and the gray scale."""
+        refined, scale = refine(frame, found, history.track, history.gray_scale, self._decoder)
+        return confirmed(frame, found, refined, self._decoder, self.config), scale
 
     def _poses(
         self, ids: IntArray, covariances: FloatArray, at: ImagePoints, T_camera_map: FloatArray | None

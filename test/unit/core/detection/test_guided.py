@@ -110,6 +110,19 @@ def test_wrong_prediction_leaves_the_blind_search_to_find_all():
     assert rows['id'].tolist() == sorted(frame.corners_px)
 
 
+def test_a_filter_that_diverges_blinds_no_detector():
+    """As with an IMU in degrees a second: none was found in six of eight frames, and the pose ran away unseen."""
+    turning = {'angular_velocity_body': np.array([0.0, 15.0, 0.0]), 'twist_covariance': 1e-4 * np.eye(6)}
+    each = detector()
+    for frame in frames(8.0, 8):
+        hint = motion_prior(replace(odometry(frame), **turning))
+        rows = each.detect(frame.stamp_ns, frame.counts, CAMERA, hint)
+        assert rows['id'].tolist() == sorted(frame.corners_px)
+        truth = np.array([frame.corners_px[marker_id] for marker_id in rows['id'].tolist()])
+        # Of 512 coordinates one is beyond four standard deviations in thirty draws.
+        assert np.all(np.abs(corners_px(rows) - truth).max(axis=(1, 2)) < 4.0 * rows['sigma_px'])
+
+
 @pytest.mark.parametrize('rate', [8.6, 30.0, pytest.param(60.0, marks=pytest.mark.nightly)])
 def test_a_marker_that_is_not_mapped_is_found_as_soon_at_any_frame_rate(rate):
     """It comes into view while the mapped ones are where odometry has them: within the period and a frame more."""
