@@ -4,10 +4,12 @@ from itertools import pairwise
 import time
 
 import pytest
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, Imu
+from support.messages import imu
 
 from thermal_fiducial.config import LandingTargetConfig
 from thermal_fiducial.nodes.landing_target import LandingTarget
+from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import ERROR, StageNode
 
@@ -51,6 +53,29 @@ def test_a_second_node_of_the_same_name_is_reported(graph, capfd):
     second.destroy_node()
     graph.spin_until(lambda: first.get_node_names_and_namespaces().count(('landing_target', '/')) == 1)
     assert words not in graph.diagnose(first)[1]
+
+
+def test_two_imus_on_one_topic_are_named(graph):
+    """They were taken for one of twice the rate, whose axes, sign and units were doubted."""
+    node = graph.add(PoseEkfNode, live=True)
+    graph.send('imu/data', imu(0))
+    second = graph.tester.create_publisher(Imu, 'imu/data', qos.RESULT)
+    graph.spin_until(lambda: graph.input(node, 'imu/data').publishers == 2)
+    words = 'two publishers on imu/data'
+    # Not before DDS has forgotten a driver that was killed, after 20 s.
+    for _ in range(20):
+        node.diagnose(0)
+    graph.send('imu/data', imu(1))
+    assert words not in graph.diagnose(node)[1]
+    for _ in range(10):
+        node.diagnose(0)
+    graph.send('imu/data', imu(2))
+    assert words in graph.diagnose(node)[1]
+    graph.tester.destroy_publisher(second)
+    graph.spin_until(lambda: graph.input(node, 'imu/data').publishers == 1)
+    node.diagnose(0)
+    graph.send('imu/data', imu(3))
+    assert words not in graph.diagnose(node)[1]
 
 
 def test_timers_have_their_turn_in_an_overload(graph):

@@ -37,7 +37,8 @@ _RATES = ('image_rate', 'imu_rate')
 _LONGEST_REASON = 400
 #: Diagnostics, one a second, after which the console repeats why messages are refused if it is still the same.
 _REPEATED_AFTER = 30
-#: Diagnostics after which a second node of the same name counts as alive: DDS takes 20 s to forget one that was killed.
+#: Diagnostics after which a second node of the same name, or publisher, counts as alive: DDS takes 20 s to forget one
+#: that was killed.
 _TWIN_AFTER = 30
 
 
@@ -94,8 +95,8 @@ class StageNode(CountingNode, Generic[Config]):
         self._rates = InputRates(self.inputs, _expected_rate(self.config))
         #: why the node cannot go on in this process; see ``run``
         self.deaf = ''
-        # Diagnostics in a row for which there has been a second node of this name.
-        self._twin_for = 0
+        # Diagnostics in a row for which there has been a second node of this name, or publisher of the main input.
+        self._twin_for = self._shared_for = 0
         #: console lines for a pilot
         self.console = Console(self.get_logger())
         #: warnings of the configuration, besides parameters that others keep from having an effect
@@ -224,7 +225,7 @@ class StageNode(CountingNode, Generic[Config]):
         self._rates.look(stamp_ns if not self.live or self._on_sim_time else time.monotonic_ns())
         if self.live and not self.deaf:
             self._listen()
-            self._look_for_twin()
+            self._look_for_doubles()
         level, reason = self._level()
         self.console.say(self._twin or self._rates.trouble() or self.headline(), calm=level == OK)
         counts: dict[str, object] = {f'received {source.topic}': source.count for source in self.inputs}
@@ -250,10 +251,14 @@ class StageNode(CountingNode, Generic[Config]):
             self.deaf = f'deaf: port {", ".join(ports)} of the shared memory has been replaced'
             self.get_logger().error(f'{self.deaf}; the node starts again')
 
-    def _look_for_twin(self) -> None:
-        """Count for how long another node has had this one's name, as when a launch file was started twice."""
+    def _look_for_doubles(self) -> None:
+        """Count for how long another node has had this one's name, as when a launch file was started twice.
+
+        And for how long the main input has had two publishers: two IMUs, say, which look like one of twice the rate.
+        """
         same = self.get_node_names_and_namespaces().count((self.get_name(), self.get_namespace()))
         self._twin_for = self._twin_for + 1 if same > 1 else 0
+        self._shared_for = self._shared_for + 1 if self.inputs and self.inputs[0].publishers > 1 else 0
 
     @property
     def _twin(self) -> str:
@@ -271,7 +276,8 @@ class StageNode(CountingNode, Generic[Config]):
         if self._rates.silent:
             return ERROR if self._rates.stopped else WARN, f'nothing on {self._rates.main}'
         level, reason = self.state()
-        doubts = [*filter(None, [self._rates.doubt()]), *without_effect(self.config), *self.remarks]
+        shared = f'two publishers on {self._rates.main}' if self._shared_for >= _TWIN_AFTER else ''
+        doubts = [*filter(None, [shared, self._rates.doubt()]), *without_effect(self.config), *self.remarks]
         return (max(level, WARN), '; '.join([reason, *doubts])) if doubts else (level, reason)
 
     def _on_timer(self) -> None:
