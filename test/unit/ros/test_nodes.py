@@ -691,8 +691,8 @@ def test_a_reset_is_logged_with_its_reason_and_then_the_recovery(graph, capfd):
     lines = [line.partition('[pose_ekf]: ')[2] for line in capfd.readouterr().err.splitlines()]
     assert lines == [
         'initialised: tracking',
-        'reset: the poses contradict the estimate and agree with each other; '
-        'if in fast motion: readout_time, bolometer_lag? if again and again: axes, sign, units of the IMU?',
+        'reset: the poses contradict the estimate and agree with each other; if in fast motion: camera_time_offset, '
+        'readout_time, bolometer_lag? if again and again: axes, sign, units of the IMU?',
         'reset: on request',
         'waiting for markers',
         'recovered: tracking',

@@ -84,10 +84,11 @@ def test_poses_that_contradict_the_estimate_and_agree_reset_it():
     assert not belief.main.in_doubt
     assert belief.alternative is None
     assert belief.resets == 1
-    # With the parameters that do this in fast motion: a line readout of 16 ms that was not declared did.
+    # With the parameters that do this in fast motion: a line readout of 16 ms that was not declared did, and a camera's
+    # clock that is 0.3 s off.
     assert belief.reset_reason == (
-        'the poses contradict the estimate and agree with each other; if in fast motion: readout_time, bolometer_lag? '
-        'if again and again: axes, sign, units of the IMU?'
+        'the poses contradict the estimate and agree with each other; if in fast motion: camera_time_offset, '
+        'readout_time, bolometer_lag? if again and again: axes, sign, units of the IMU?'
     )
 
 
