@@ -830,6 +830,7 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountE
         'The pose is lost when the standard deviation of the position exceeds this.',
         unit='m',
         minimum=0.001,
+        maximum=10.0,
         dynamic=True,
     )
     reinitialise_after: float = param(

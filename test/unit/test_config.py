@@ -154,6 +154,7 @@ def test_no_number_may_be_infinite_or_nearly_a_division_by_zero(kind):
         ('initial_gyroscope_bias_std', 5.0),  # degrees a second
         ('max_imu_gap', 1000.0),  # ms
         ('smoothing_time', 100.0),  # ms
+        ('lost_position_std', 300.0),  # mm
     ],
 )
 def test_numbers_of_the_filter_in_other_units_are_refused(name, value):
