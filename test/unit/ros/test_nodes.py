@@ -253,19 +253,39 @@ def test_a_calibration_of_another_resolution_is_doubted(graph):
     assert 'principal point (160, 128) in images of 640x512 pixels: is the calibration of another resolution?' in words
 
 
-def test_a_doubt_of_a_calibration_ends_with_it(graph, capfd):
-    """Two drivers of one camera, of which one has the calibration of another resolution, and then has it no more."""
+def test_a_doubt_of_a_calibration_ends_with_it(graph):
     node = graph.add(ArucoDetector, marker_size=small_bag.SIZE)
     doubtful = replace(small_bag.CAMERA, K=small_bag.CAMERA.K * [[0.5], [0.5], [1.0]])
-    for _ in range(5):
-        graph.send('thermal/camera_info', info(doubtful), info())
-        assert 'another resolution' not in graph.diagnose(node)[1]
-    graph.send('thermal/camera_info', info(doubtful), info(), info(doubtful))
+    graph.send('thermal/camera_info', info(doubtful))
+    assert 'another resolution' in ' '.join(node.remarks)
+    graph.send('thermal/camera_info', info())
     graph.send('thermal/image', frames(1)[0])
     level, words, figures = graph.diagnose(node)
-    assert (level, words.count('another resolution'), figures['calibrations']) == (WARN, 1, '13')
-    # Once a second at most: they come with each frame.
-    assert capfd.readouterr().err.count('camera_info has changed') == 6
+    assert (level, words, figures['calibrations']) == (OK, '4 markers', '2')
+
+
+@pytest.mark.parametrize('kind', [ArucoDetector, MarkerMapperNode])
+def test_two_calibrations_in_turns_give_no_pose(graph, capfd, kind):
+    """Of a driver beside calibration_file: each frame had one of them, and poses were 0.1 to 0.4 m off."""
+    node = graph.add(kind, marker_size=small_bag.SIZE)
+    other = info(replace(small_bag.CAMERA, K=small_bag.CAMERA.K * [[1.1], [1.1], [1.0]]))
+    # A calibration that changes once, in one that never was the first again, is used.
+    graph.send('thermal/camera_info', other, other, info())
+    node.take_waiting()
+    assert node.camera().matches(small_bag.CAMERA)
+    for _ in range(5):
+        graph.send('thermal/camera_info', other, info())
+        graph.diagnose(node)
+    with pytest.raises(
+        InputError, match='two calibrations in turns, of two drivers, or of one beside calibration_file'
+    ):
+        node.camera()
+    # The first change is logged, those that have no effect are not.
+    assert capfd.readouterr().err.count('camera_info has changed') == 1
+    # It is over when one of them has been alone for ten seconds.
+    graph.send('thermal/camera_info', *[info()] * 300)
+    node.take_waiting()
+    assert node.camera().matches(small_bag.CAMERA)
 
 
 def test_parameters_that_do_nothing_are_warned_of_while_the_detector_works(graph):

@@ -10,6 +10,9 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base.node import StageNode
 from thermal_fiducial.ros.messages import convert, message_bytes
 
+# Messages of one calibration after which an earlier one is no longer expected to come back: ten seconds at 30 Hz.
+_SETTLED = 300
+
 
 class LatestCalibration:
     """The last valid ``camera_info`` of a topic.
@@ -25,6 +28,9 @@ class LatestCalibration:
         self._what = f'camera_info of {name}' if name else 'camera_info'
         self._camera: Camera | None = None
         self._message = b''
+        # The calibration before, messages since then, and whether the two come in turns.
+        self._before: Camera | None = None
+        self._since, self._in_turns = 0, False
         #: of the calibration, among the remarks of the node; empty without one
         self._doubt = ''
         #: number of different calibrations received
@@ -36,28 +42,35 @@ class LatestCalibration:
         Raises
         ------
         InputError
-            None has been received yet.
+            None has been received yet, or two come in turns: each would give every other frame another lens.
         """
         if self._camera is None:
             raise InputError(f'no {self._what}')
+        if self._in_turns:
+            what = 'two calibrations in turns, of two drivers, or of one beside calibration_file'
+            raise InputError(f'{self._what}: {what}: give one of them another topic')
         return self._camera
 
     def take(self, message: bytes) -> None:
         """Validate a serialised ``camera_info`` if it differs from the last one."""
+        self._since += 1
+        self._in_turns &= self._since < _SETTLED
         if message[message_bytes.BEHIND_STAMP :] == self._message:
             return
         camera = convert.camera(message_bytes.read(message, CameraInfo, 'camera_info'))
         self._message = message[message_bytes.BEHIND_STAMP :]
         if self._camera is not None and camera.matches(self._camera):
             return
-        self._camera = camera
+        self._in_turns |= self._before is not None and camera.matches(self._before) and self._since < _SETTLED
+        self._before, self._camera, self._since = self._camera, camera, 0
         self.count += 1
         if self._doubt:
             self._node.remarks.remove(self._doubt)
         self._doubt = doubt_of_resolution(camera)
         if self._doubt:
             self._node.remarks.append(self._doubt)
-        changed = f'{self._what} has changed: the new calibration is used from here on' if self.count > 1 else ''
+        used = self.count > 1 and not self._in_turns
+        changed = f'{self._what} has changed: the new calibration is used from here on' if used else ''
         if news := '; '.join(filter(None, [changed, self._doubt])):
             # Two drivers of one camera change it with each frame.
             self._node.console.event(self._what, news)
