@@ -26,6 +26,8 @@ def check_file(path: Path) -> None:
         require_regular(path)
     if path.suffix == '.mcap':
         _check_mcap(path)
+    if path.suffix == '.db3':
+        _check_sqlite3(path)
     if path.suffix == '.bag':
         with path.open('rb') as file:
             if file.read(len(_ROS1_BEGIN)) != _ROS1_BEGIN:
@@ -40,6 +42,14 @@ def _check_mcap(path: Path) -> None:
         end = file.read()
     if begin == _MCAP_MAGIC != end:
         raise InputError(f'{path}: the recording of this bag was cut off, or goes on: mcap recover {path} -o NEW.mcap')
+
+
+def _check_sqlite3(path: Path) -> None:
+    """Raise InputError for a recording with messages beside its file, which the library would leave out."""
+    for beside in (path.with_name(f'{path.name}{suffix}') for suffix in ('-wal', '-journal')):
+        if beside.is_file() and beside.stat().st_size:
+            remedy = f'sqlite3 {path} "SELECT count(*) FROM messages" completes it'
+            raise InputError(f'{path}: the recording of this bag was cut off, or goes on: {remedy}')
 
 
 def check_metadata(path: Path) -> None:

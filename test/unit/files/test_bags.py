@@ -1,4 +1,7 @@
+from contextlib import closing
 import re
+import shutil
+import sqlite3
 
 import numpy as np
 import pytest
@@ -229,6 +232,24 @@ def test_a_recording_that_was_cut_off_names_the_remedy(tmp_path, bytes_left):
             read_all(path)
         remedy = f'the recording of this bag was cut off, or goes on: mcap recover {file} -o NEW.mcap'
         assert str(raised.value) == f'{file}: {remedy}'
+
+
+def test_messages_that_a_crash_left_beside_a_bag_are_not_left_out(tmp_path):
+    """SQLite keeps the last ones in a file of its own; half of a bag was read without a word."""
+    folder = write(tmp_path / 'bag', storage='sqlite3')
+    (file,) = folder.glob('*.db3')
+    with closing(sqlite3.connect(file)) as recorder:
+        recorder.execute('PRAGMA journal_mode=WAL')
+        recorder.execute('UPDATE messages SET timestamp = timestamp + 1')
+        recorder.commit()
+        crashed = shutil.copytree(folder, tmp_path / 'crashed') / file.name
+    for path in (crashed.parent, crashed):
+        with pytest.raises(InputError, match='was cut off, or goes on: sqlite3 ') as raised:
+            read_all(path)
+    command = str(raised.value).partition('sqlite3 ')[2].partition('"')[2].partition('"')[0]
+    with closing(sqlite3.connect(crashed)) as recovered:
+        count = recovered.execute(command).fetchone()[0]
+    assert len(read_all(crashed)) == count
 
 
 @pytest.mark.parametrize('name', ['a.bag', 'a.mcap', 'a.db3', 'a.txt'])
