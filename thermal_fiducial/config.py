@@ -501,9 +501,10 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
     )
     readout_time: float = param(
         0.0,
-        'Rolling-shutter readout time from first to last row; the stamp refers to the middle row. 0: global shutter.',
+        'Rolling-shutter readout time from first to last row; the stamp refers to the middle row. 0: global shutter; '
+        'negative: last row first, as where the driver turns pictures upside down.',
         unit='s',
-        minimum=0.0,
+        minimum=-0.05,
         maximum=0.05,
     )
     blur_px: float = param(

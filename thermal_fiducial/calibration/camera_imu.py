@@ -10,7 +10,7 @@ rows that they are computed from.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import compress
 
 import numpy as np
@@ -48,7 +48,8 @@ class CameraImuCalibration:
     T_body_camera : (4, 4)
     time_offset : t_imu = t_camera + offset [s]; the bolometers' lag is part of it where the poses carry it
     covariance : (7, 7) of the rotation about the camera's axes [rad], position [m], offset [s]
-    readout_time : from the sampling of the first row to that of the last [s]; 0 unless it is clearly more
+    readout_time : from the sampling of the first row to that of the last [s]; negative where the last row is the first;
+        0 unless it is clearly another
     readout_sigma : its standard deviation [s]; inf when the corners were not given
     stamp_jitter : standard deviation of the camera's stamps about the time offset [s]
     gravity_map : (3,) [m/s^2]
@@ -129,7 +130,7 @@ def calibrate_rolling_camera_imu(
     _, problem, second = _rolling(recording, solved, camera, shaken, first.jitter, first.state)
     second = problem.repeated(second)
     sigma = float(np.sqrt(second.covariance[9, 9]))
-    if second.state.readout <= _SIGNIFICANT * sigma:
+    if abs(second.state.readout) <= _SIGNIFICANT * sigma:
         poses = [frame.pose for frame in at_once]
         systematic = [frame.systematic for frame in at_once]
         problem, second = recording.solved(poses, shaken, first.jitter, first.state, systematic)
@@ -151,7 +152,7 @@ def _rolling(
         poses, rows = [frame.pose for frame in solved], [frame.rows for frame in solved]
         systematic = [frame.systematic for frame in solved]
         problem, solution = recording.solved(poses, noise, jitter, state, systematic, rows, readout)
-        state = replace(solution.state, readout=max(0.0, solution.state.readout))
+        state = solution.state
         if abs(state.readout - readout) < _SETTLED:
             break
         readout = state.readout

@@ -287,13 +287,15 @@ def test_an_imu_that_contradicts_the_camera_is_refused(change, sensor):
 READOUT = 0.016
 
 
-def test_noiseless_rolling_recording_gives_the_readout_time_back():
+@pytest.mark.parametrize('readout', [READOUT, -READOUT])
+def test_noiseless_rolling_recording_gives_the_readout_time_back(readout):
+    """Also that of a camera whose driver turns pictures upside down, which was written as none."""
     scenario = replace(SCENARIO, imu=NO_NOISE)
-    frames, camera, imu = rolling_recording(scenario, 13.0, 2, READOUT, sigma_px=0.0)
+    frames, camera, imu = rolling_recording(scenario, 13.0, 2, readout, sigma_px=0.0)
     result = calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, IMU)
     error = np.abs(error_of(result, scenario))
     # As without a read-out: samples are interpolated. A microsecond at 1000 px/s is 0.001 px.
-    assert abs(result.readout_time - READOUT) < 1e-6
+    assert abs(result.readout_time - readout) < 1e-6
     assert np.all(error[:3] < 2e-5)
     assert np.all(error[3:6] < 1e-4)
     assert error[6] < 2e-6

@@ -93,7 +93,8 @@ def test_rows_that_are_read_later_are_displaced_and_no_more_blurred(lag):
     np.testing.assert_allclose(motion.lag, places.lag_blur(TWIST, lag), rtol=1e-12, atol=1e-12)
 
 
-def test_corners_of_rows_that_are_read_early_claim_what_the_twist_is_uncertain_by():
+@pytest.mark.parametrize('readout', [0.025, -0.025])
+def test_corners_of_rows_that_are_read_early_claim_what_the_twist_is_uncertain_by(readout):
     """A marker near the top of the image, at rest, by a twist that is known to 0.1 rad/s."""
     decoder = Decoder(load_dictionary('DICT_4X4_50').bits)
     image = np.full((512, 640), 7000.0)
@@ -103,7 +104,7 @@ def test_corners_of_rows_that_are_read_early_claim_what_the_twist_is_uncertain_b
     corners = np.array([279.5, 39.5]) + 72.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     camera, one = Camera(640, 512, [[440.0, 0, 319.5], [0, 440.0, 255.5], [0, 0, 1]]), np.ones(1, dtype=bool)
     still = Twist(np.zeros(6), np.diag([0.0, 0.0, 0.0, 0.1, 0.1, 0.0]) ** 2)
-    frame = Frame(0, image.astype(np.float32), 1.0, camera, still, 0.0, 0.025, ArucoDetectorConfig().blur_px, image)
+    frame = Frame(0, image.astype(np.float32), 1.0, camera, still, 0.0, readout, ArucoDetectorConfig().blur_px, image)
     found = FoundMarkers(
         np.array([7]),
         Places.of(ImagePoints.at(corners[None], camera), np.ones((1, 4))),

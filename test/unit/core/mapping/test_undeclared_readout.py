@@ -7,7 +7,7 @@ import pytest
 from support.scenes import motion_prior
 from support.walls import CAMERA, flight, look, rows, SIZE, stamp, wall
 
-from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, screw_difference
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
@@ -118,6 +118,8 @@ def test_the_warning_says_what_to_write():
     assert found.doubt == 'rows are read over 14.7 +- 1.5 ms more than readout_time says: add 0.0147'
     found.seconds = -0.0074
     assert found.doubt == 'rows are read over 7.4 +- 1.5 ms less than readout_time says: subtract 0.0074'
+    # Also from 0, where the driver turns pictures upside down.
+    assert ArucoDetectorConfig(readout_time=found.seconds).readout_time == -0.0074
 
 
 def away_mm(located, since):

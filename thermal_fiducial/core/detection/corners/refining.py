@@ -218,7 +218,7 @@ def _at_stamp(
         unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur, displayed=frame.displayed)
         if frame.twist is None:
             unknown = unknown + _of_unpredicted_motion(frame, places, refined, twist, cells)
-        elif frame.readout > 0.0:
+        elif frame.readout != 0.0:
             # By a wrong twist rows are displaced the more, the farther they are from the middle one.
             by_twist = delays(rows, frame)[..., None, None] * places.flow
             unknown = unknown + by_twist @ twist.covariance @ by_twist.swapaxes(-1, -2)

@@ -177,7 +177,7 @@ class MarkerFinder:
             mapped, mine = np.nonzero(in_map.ids[:, None] == ids)
             depth[mine] = in_map.depth[mapped]
         places = Places.of(at, depth)
-        if frame.readout > 0.0:
+        if frame.readout != 0.0:
             # Places at the stamp, without the displacement by the rolling shutter.
             rolling = rolling_displacement(places, frame.twist, frame, corners[..., 1])
             places = Places.of(ImagePoints.at(corners - rolling, frame.camera), depth)
