@@ -67,6 +67,21 @@ def test_a_map_of_another_dictionary_is_used_and_warned_of(graph, map_file, capf
     assert 'has markers of DICT_5X5_50, but dictionary is DICT_4X4_50' in capfd.readouterr().err
 
 
+def test_a_flight_that_leaves_markers_out_of_the_map_ends_with_why(graph, map_file, capfd):
+    """With another side than theirs in marker_size none entered, and console and diagnostics were "ok"."""
+    node = graph.add(MarkerMapperNode, map_file=str(map_file))
+    graph.send('thermal/camera_info', info())
+    markers = small_bag.map_of([0, 1]).markers
+    ids, sizes = np.array(list(markers)), np.full(len(markers), small_bag.SIZE)
+    points = corners_in_map(np.stack([marker.T_map_marker for marker in markers.values()]), sizes)
+    corners = small_bag.CAMERA.project(apply(inverse(small_bag.true_pose(0.0) @ small_bag.T_BODY_CAMERA), points))
+    noise = np.tile(0.05**2 * np.eye(2), (len(ids), 4, 1, 1))
+    rows = rows_from_corners(ids, corners, noise, sizes, small_bag.CAMERA)
+    graph.send('markers', clouds.cloud(rows, convert.header(START, 'camera')))
+    node.finish()
+    assert 'not in the map: marker 1 needs views from more directions' in capfd.readouterr().err
+
+
 @pytest.mark.parametrize('focal', [1.0, 1.05])
 def test_a_calibration_that_does_not_fit_the_map_is_doubted(graph, tmp_path, focal):
     """Before markers of different distances; those of one wall fit any focal length."""

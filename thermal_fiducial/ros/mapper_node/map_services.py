@@ -13,6 +13,7 @@ from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.wording import listed
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import bring_beside, other_patterns
 from thermal_fiducial.files.map_keeper import MapKeeper
@@ -26,6 +27,8 @@ Answer = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
 
 #: Time for which a service waits for a disk [s]; no frame is processed meanwhile.
 _PATIENCE_S = 1.0
+#: Largest number of markers that are named at the end, as they are not in the map.
+_MOST_NAMED = 20
 #: Time for the last refinement [s]: one takes a second or two, and ros2 launch grows impatient after five.
 _LAST_REFINEMENT_S = 3.0
 
@@ -206,10 +209,12 @@ class MapServices:
         return response
 
     def _finish(self) -> None:
-        """Refine the map with the last keyframes of the flight, before it is saved at the end.
+        """Name what was seen and is not in the map; refine it with the last keyframes before it is saved at the end.
 
         A copy is saved first: whoever starts the node may kill it for taking its time.
         """
+        if waiting := [candidate.reason for _, candidate in sorted(self.mapper.candidates.items())]:
+            self._node.get_logger().warning(f'not in the map: {listed(waiting, _MOST_NAMED)}')
         to_do = self._keeper.unsaved or self.mapper.has_unrefined or self.refinement.busy
         if not (self._node.config.map_file and to_do):
             return
