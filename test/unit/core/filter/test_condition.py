@@ -128,4 +128,4 @@ def test_a_gyroscope_of_wrong_sign_is_named_also_after_the_start():
     wrong = [replace(sample, angular_velocity=-sample.angular_velocity) for sample in samples[RATE:]]
     run(ekf, timeline(samples[:RATE] + wrong, flight.poses))
     assert ekf.resets > 1
-    assert 'axes, sign, units of the IMU?' in ekf.reset_reason
+    assert 'axes, sign, units of the IMU' in ekf.reset_reason
