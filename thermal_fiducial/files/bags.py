@@ -32,6 +32,8 @@ CAMERA_POSE_TOPIC = 'camera_pose'
 MAP_ERROR_TOPIC = 'camera_pose/map_error'
 TRUTH_TOPIC = 'ground_truth/odometry'
 
+#: First bytes of what zstd has compressed; a serialised message begins with a zero.
+_ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 #: Topics that a second camera has in its namespace.
 _OF_CAMERA = (IMAGE_TOPIC, COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, MARKERS_TOPIC)
 #: Names that are resolved in any namespace of the bag.
@@ -261,7 +263,10 @@ class BagReader:
         self._learn(connection)
         if isinstance(self._reader, Rosbag1Reader):
             return bytes(self._typestore.ros1_to_cdr(raw, connection.msgtype))
-        return bytes(raw)
+        cdr = bytes(raw)
+        if cdr.startswith(_ZSTD_MAGIC):
+            raise InputError(f'{self.path}: its messages are compressed, as metadata.yaml says: give the folder')
+        return cdr
 
     def _learn(self, connection: Connection) -> None:
         """Register a type that is not part of ROS from its definition in the bag, if it has one."""

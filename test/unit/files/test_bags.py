@@ -328,6 +328,14 @@ def test_compressed_bags_are_read_but_none_that_expands_without_bound(tmp_path, 
         read_all(bomb)
 
 
+def test_a_single_file_of_compressed_messages_names_the_folder(tmp_path):
+    """That they are compressed stands in metadata.yaml alone: "cannot be decoded" was all."""
+    folder = compressed(tmp_path / 'bag', CompressionMode.MESSAGE, 'as recorded')
+    (file,) = (path for path in folder.iterdir() if path.name != 'metadata.yaml')
+    with pytest.raises(InputError, match=r'its messages are compressed, as .* says: give the folder'):
+        read_all(file)
+
+
 @pytest.mark.parametrize('kind', [Rosbag1Writer.CompressionFormat.BZ2, Rosbag1Writer.CompressionFormat.LZ4])
 def test_chunks_of_ros_1_expand_as_little(tmp_path, kind):
     old = get_typestore(Stores.ROS1_NOETIC)
