@@ -149,6 +149,10 @@ def test_a_replay_says_that_it_replaces_an_earlier_one(short, folder, tmp_path, 
     for said in (0, 1):
         assert replay(folder / 'short', tmp_path / 'run', folder) == 0
         assert capfd.readouterr().out.count(f'{tmp_path / "run"}: replacing the earlier run there') == said
+    # Not where it is refused, and the earlier one stays.
+    assert replay(folder / 'nothing', tmp_path / 'run', folder) == 2
+    assert 'replacing' not in capfd.readouterr().out
+    assert (tmp_path / 'run' / 'summary.json').exists()
 
 
 def test_a_folder_into_which_another_replay_writes_is_left_alone(folder, tmp_path, capfd):

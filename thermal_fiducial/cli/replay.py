@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
     _check_packages(report=not args.no_report, video=args.video)
     if args.video:
         _require_images(args)
-    from thermal_fiducial.replay.session import Options, replay
+    from thermal_fiducial.replay.session import check, Options, replay
 
     options = Options(
         bag=args.bag,
@@ -91,6 +91,8 @@ def run(args: argparse.Namespace) -> int:
         remaps=parse_remaps(args.remap),
     )
     if replaces:
+        # What is refused replaces nothing.
+        check(options)
         print(f'{args.out}: replacing the earlier run there')
     started = time.monotonic()
     with progress_bar(f'replay {args.bag.name}') as progress:
