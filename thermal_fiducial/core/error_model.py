@@ -61,7 +61,7 @@ DECISION_PX = SystematicErrors.corner_px
 #: 99.9 % quantile of chi square with eight degrees of freedom, of a view of a marker.
 CHI2_OF_VIEW = 26.1
 #: Errors of successive poses last as long as the view, for seconds: this many count as one. Enters the clock of a
-#: second camera (``SecondClock``), and the evidence of an undeclared readout (``UndeclaredReadout``).
+#: second camera (``SecondClock``).
 CORRELATED_POSES = 30.0
 #: Readout time of a rolling shutter [s]: what a calibration leaves of it (0.1 to 0.3 ms where rows are read in 16 ms),
 #: and how much of it may not be declared (cores read their rows in 8 to 33 ms, or all at once). Enter the decision that

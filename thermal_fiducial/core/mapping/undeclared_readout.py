@@ -12,7 +12,6 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.error_model import (
-    CORRELATED_POSES,
     covariance_of_one_error,
     drawn_sum,
     DRAWS,
@@ -57,8 +56,8 @@ class UndeclaredReadout:
         self.seconds, self.std = 0.0, 0.0
         # The time while it is likely at least.
         self._likely = 0.0
-        # Sums over frames: information, information times the time, and the variance of that by errors that last for
-        # seconds, and its joint draws by errors of lens and map, which last as long as the flight.
+        # Sums over frames: information, information times the time, and the variance of that by noise, and its joint
+        # draws by errors of lens and map, which last as long as the flight.
         self._information, self._weighted, self._variance = 0.0, 0.0, 0.0
         self._common: FloatArray = np.zeros(DRAWS)
         # What the last adjustment of the map has found.
@@ -109,11 +108,10 @@ class UndeclaredReadout:
         common = location.lens.drawn_sum(by_corners)[0] - drawn_sum(by_map, sight.draws)[0]
         # A wrong velocity shows another time, by what it is unsure by.
         noise = information * (noise_factor(chi2, len(rest) - 7) + READOUT_STD**2 * unsure)
-        lasting = float(np.mean(common**2))
-        weight = information / (noise + lasting + TINY)
+        weight = information / (noise + float(np.mean(common**2)) + TINY)
         self._information += weight * information
         self._weighted += weight * (shown + information * self.seconds)
-        self._variance += weight**2 * (noise + CORRELATED_POSES * lasting)
+        self._variance += weight**2 * noise
         self._common += weight * common
         self._judge()
 
