@@ -29,7 +29,7 @@ from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.types import FloatArray, TINY
 
 #: Standard deviations by which the time must be off before corners are corrected by it. In flights as declared it is up
-#: to 1.7.
+#: to 2.7.
 CONTRADICTS = 4.0
 # And before residuals count as of it, not of an error of the lens.
 _LIKELY = 1.0
