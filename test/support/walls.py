@@ -5,9 +5,10 @@ import numpy as np
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject, screw_difference
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, so3_exp, transform
-from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE
+from thermal_fiducial.core.lens_errors import LensErrors
+from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE, Odometry
 
 SIZE = 0.3
 CAMERA = Camera(640, 512, np.array([[529.0, 0.0, 319.5], [0.0, 529.0, 255.5], [0.0, 0.0, 1.0]]))
@@ -15,6 +16,10 @@ CAMERA = Camera(640, 512, np.array([[529.0, 0.0, 319.5], [0.0, 529.0, 255.5], [0
 NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 #: 30 frames a second, counted from 1 s.
 FRAME_NS = 33_333_333
+#: Standard deviations of the velocity [m/s] and of the turn rate [rad/s] of a filter.
+TWIST_STD = 0.03, 0.01
+# Noise of corners that are read row by row [px].
+_SIGMA = 0.05
 # A marker that hangs on the wall x = 0 and faces -x: its x to map -y, its y to map z.
 _FACING = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
@@ -57,6 +62,38 @@ def flight(t):
     """T_map_camera of a slow flight in front of the wall at time ``t`` [s]."""
     position = [-3.2 + 0.7 * np.sin(0.6 * t), 1.4 * np.sin(0.45 * t), 1.5 + 0.5 * np.sin(0.8 * t)]
     return look(position, [0.0, 0.6 * np.sin(0.31 * t), 1.5 + 0.2 * np.sin(0.5 * t)], 0.1 * np.sin(0.7 * t))
+
+
+def brisk(t):
+    """T_map_camera at a time [s]: 1 m/s, and turns of 1 rad/s."""
+    T = look([-3.2, 0.5 * np.sin(2.0 * t), 1.5 + 0.2 * np.sin(1.3 * t)], [0.0, 0.0, 1.5])
+    return T @ transform(so3_exp([0.15 * np.sin(3.1 * t), 0.35 * np.sin(2.7 * t + 1.0), 0.05 * np.sin(t)]), np.zeros(3))
+
+
+def odometry(path, k, rng, twist_std=TWIST_STD):
+    """The filter's at frame ``k``, as the camera is the body: the true pose, and a velocity that is unsure."""
+    t, truth, stds = k / 30, path(k / 30), np.repeat(twist_std, 3)
+    in_map = screw_difference(path(t + 1e-4), path(t - 1e-4)) / 2e-4
+    twist = np.concatenate([in_map[:3] @ truth[:3, :3], in_map[3:] @ truth[:3, :3]]) + stds * rng.normal(size=6)
+    of_pose = np.diag(np.repeat([0.01, 0.0025], 3) ** 2)
+    return Odometry(stamp(k), truth, twist[:3], twist[3:], of_pose, np.diag(stds**2))
+
+
+def read_row_by_row(path, t, poses, readout, rng, lens=None):
+    """Markers of a frame at ``t`` [s] whose corners are where they are when their own rows are read."""
+    ids, middle = np.array(sorted(poses)), (CAMERA.height - 1) / 2.0
+    points = corners_in_map(np.stack([poses[key] for key in ids]), np.full(len(ids), SIZE))
+    v = np.full((len(ids), 4), middle)
+    for _ in range(4):
+        instants = t + readout * (v / (CAMERA.height - 1) - 0.5)
+        T = np.stack([path(instant) for instant in instants.ravel()]).reshape(*v.shape, 4, 4)
+        away = (points - T[..., :3, 3])[..., None, :]
+        px = CAMERA.project((away @ T[..., :3, :3])[..., 0, :])
+        v = px[..., 1]
+    if lens is not None:
+        px = px + LensErrors(px, CAMERA, SystematicErrors()).drawn()[..., lens]
+    seen = CAMERA.contains(px, 5.0).all(axis=-1)
+    return rows(ids[seen], px[seen] + _SIGMA * rng.normal(size=px[seen].shape), _SIGMA)
 
 
 def stamp(k):

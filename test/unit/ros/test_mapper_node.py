@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
-from support import small_bag
-from support.messages import info, START
+from support import small_bag, walls
+from support.messages import info, odometry, START
 from visualization_msgs.msg import Marker, MarkerArray
 
 from thermal_fiducial.cli.main import main
@@ -116,6 +116,24 @@ def test_a_rolling_shutter_that_is_not_as_declared_is_named(graph, map_file):
     said = 'rows are read over 14.7 +- 1.5 ms more than readout_time says: add 0.0147'
     level, reason = node.state()
     assert (level, node.headline(), said in reason) == (WARN, said, True)
+
+
+def test_a_rolling_shutter_of_the_second_camera_is_named_as_its_own(graph, tmp_path):
+    rng, here = np.random.default_rng(5), {'position': [0.0, 0.0, 0.0], 'orientation': [0.0, 0.0, 0.0, 1.0]}
+    poses = walls.wall(rng)
+    save_map(tmp_path / 'map.yaml', MarkerMap({key: MapMarker(key, walls.SIZE, True, T) for key, T in poses.items()}))
+    mounts = {f'{camera}_{what}': value for camera in ('camera', 'second_camera') for what, value in here.items()}
+    node = graph.add(MarkerMapperNode, map_file=str(tmp_path / 'map.yaml'), second_camera='down', **mounts)
+    graph.send('down/thermal/camera_info', info(walls.CAMERA))
+    for k in range(0, 30, 2):
+        graph.send('odometry', odometry(walls.odometry(walls.brisk, k, rng)))
+        seen = walls.read_row_by_row(walls.brisk, k / 30, poses, 0.016, rng)
+        graph.send('down/markers', clouds.cloud(seen, convert.header(walls.stamp(k), 'camera')))
+    level, reason = node.state()
+    assert 'down: rows are read over 1' in reason
+    assert level == WARN
+    # The first camera has seen nothing.
+    assert node.mapper.readout.doubt == ''
 
 
 def test_saving_keeps_the_previous_file_in_the_history(graph, map_file):

@@ -5,49 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.scenes import motion_prior
-from support.walls import CAMERA, flight, look, rows, SIZE, stamp, wall
+from support.walls import brisk, CAMERA, flight, odometry, read_row_by_row, SIZE, stamp, TWIST_STD, wall
 
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
-from thermal_fiducial.core.error_model import SystematicErrors
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, screw_difference
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
-from thermal_fiducial.core.lens_errors import LensErrors
+from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.undeclared_readout import FoundReadout, UndeclaredReadout
-from thermal_fiducial.core.measurements import Odometry
 
-#: Of the velocity [m/s] and of the turn rate [rad/s] of a filter.
-TWIST_STD = 0.03, 0.01
 #: The camera is the body.
 CONFIG = MarkerMapperConfig(
     mode='localization', camera_position=(0.0, 0.0, 0.0), camera_orientation=(0.0, 0.0, 0.0, 1.0)
 )
-#: Detector's noise [px].
-SIGMA = 0.05
-
-
-def brisk(t):
-    """T_map_camera at a time [s]: 1 m/s, and turns of 1 rad/s."""
-    T = look([-3.2, 0.5 * np.sin(2.0 * t), 1.5 + 0.2 * np.sin(1.3 * t)], [0.0, 0.0, 1.5])
-    return T @ transform(so3_exp([0.15 * np.sin(3.1 * t), 0.35 * np.sin(2.7 * t + 1.0), 0.05 * np.sin(t)]), np.zeros(3))
-
-
-def read_row_by_row(path, t, poses, readout, rng, lens=None):
-    """Markers of a frame at ``t`` [s] whose corners are where they are when their own rows are read."""
-    ids, middle = np.array(sorted(poses)), (CAMERA.height - 1) / 2.0
-    points = corners_in_map(np.stack([poses[key] for key in ids]), np.full(len(ids), SIZE))
-    v = np.full((len(ids), 4), middle)
-    for _ in range(4):
-        instants = t + readout * (v / (CAMERA.height - 1) - 0.5)
-        T = np.stack([path(instant) for instant in instants.ravel()]).reshape(*v.shape, 4, 4)
-        away = (points - T[..., :3, 3])[..., None, :]
-        px = CAMERA.project((away @ T[..., :3, :3])[..., 0, :])
-        v = px[..., 1]
-    if lens is not None:
-        px = px + LensErrors(px, CAMERA, SystematicErrors()).drawn()[..., lens]
-    seen = CAMERA.contains(px, 5.0).all(axis=-1)
-    return rows(ids[seen], px[seen] + SIGMA * rng.normal(size=px[seen].shape), SIGMA)
 
 
 def flown(path, readout, seconds=5.0, lens=None, lost=TWIST_STD, mode='localization'):
@@ -63,13 +32,9 @@ def flown(path, readout, seconds=5.0, lens=None, lost=TWIST_STD, mode='localizat
     mapper = MarkerMapper(replace(CONFIG, mode=mode), start)
     located = []
     for k in range(0, round(30 * seconds), 2):
-        t, truth, stds = k / 30, path(k / 30), np.repeat(lost if k % 4 else TWIST_STD, 3)
-        in_map = screw_difference(path(t + 1e-4), path(t - 1e-4)) / 2e-4
-        twist = np.concatenate([in_map[:3] @ truth[:3, :3], in_map[3:] @ truth[:3, :3]]) + stds * rng.normal(size=6)
-        of_pose = np.diag(np.repeat([0.01, 0.0025], 3) ** 2)
-        odometry = Odometry(stamp(k), truth, twist[:3], twist[3:], of_pose, np.diag(stds**2))
+        t, prior = k / 30, motion_prior(odometry(path, k, rng, lost if k % 4 else TWIST_STD))
         seen = read_row_by_row(path, t, poses, readout, rng, lens)
-        located.append((t, mapper.process(stamp(k), seen, CAMERA, motion_prior(odometry)).pose, truth))
+        located.append((t, mapper.process(stamp(k), seen, CAMERA, prior).pose, path(t)))
         if mapper.refinement_due(stamp(k)):
             mapper.refine()
     return mapper, located
