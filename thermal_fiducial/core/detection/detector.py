@@ -100,8 +100,9 @@ class MarkerDetector:
         frame = Frame.of(stamp_ns, counts, camera, twist, config, keep_columns=keep_columns)
         found, history = self._finder.find(frame, history, known, guide, config)
         refined, scale = self._refined(frame, found, history)
-        if len(found.ids) and not len(refined.ids) and refined.blur.to_tails is not None:
-            # A filter that diverges, as with an IMU in degrees, has motion blur taken out of images that have none.
+        if len(found.ids) > 1 and not len(refined.ids) and refined.blur.to_tails is not None:
+            # A filter that diverges, as with an IMU in degrees, has motion blur taken out of images that have none. A
+            # single faint marker may be refuted by chance.
             unmoved = replace(frame, twist=None)
             again, scale_again = self._refined(unmoved, found, history)
             if len(again.ids):
