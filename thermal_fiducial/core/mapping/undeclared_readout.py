@@ -126,19 +126,18 @@ class UndeclaredReadout:
 
     def _judge(self) -> None:
         """Take the time over where it is beyond doubt."""
-        if self._by_map is not None:
-            self._likely = self.seconds = self._by_map.seconds
-            self.std = math.hypot(self._by_map.std, HIDDEN_OF_READOUT * self.seconds)
-            return
+        found = self._by_map or self._by_frames()
+        self._likely = found.seconds if found.sigmas > _LIKELY else 0.0
+        self.seconds, self.std = 0.0, 0.0
+        if found.sigmas > CONTRADICTS:
+            self.seconds, self.std = found.seconds, math.hypot(found.std, HIDDEN_OF_READOUT * found.seconds)
+
+    def _by_frames(self) -> FoundReadout:
+        """The time by the sums over frames and its prior."""
         information = max(self._information, TINY)
         variance = (self._variance + float(np.mean(self._common**2))) / information**2
         share = READOUT_STD**2 / (READOUT_STD**2 + variance)
-        seconds, std = share * self._weighted / information, math.sqrt(share * variance)
-        found = FoundReadout(seconds, std)
-        self._likely = seconds if found.sigmas > _LIKELY else 0.0
-        self.seconds, self.std = 0.0, 0.0
-        if found.sigmas > CONTRADICTS:
-            self.seconds, self.std = seconds, math.hypot(std, HIDDEN_OF_READOUT * seconds)
+        return FoundReadout(share * self._weighted / information, math.sqrt(share * variance))
 
     @property
     def doubt(self) -> str:
