@@ -226,11 +226,8 @@ class MapProblem:
 
     def with_readout(self) -> 'MapProblem':
         """With the error of the readout time among the unknowns."""
-        J, information = (
-            np.concatenate([self.J_common, self.J_readout], axis=-1),
-            np.append(self.common_information, 1.0),
-        )
-        return replace(self, J_common=J, common_information=information)
+        J_common = np.concatenate([self.J_common, self.J_readout], axis=-1)
+        return replace(self, J_common=J_common, common_information=np.append(self.common_information, 1.0))
 
     def evaluate(self, state: Poses) -> Linearised:
         """Whitened residuals and derivatives."""

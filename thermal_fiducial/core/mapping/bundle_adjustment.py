@@ -81,18 +81,16 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
     now = _minimise(problem, now)
     mirrored = _with_mirrored(problem, now)
     now = now if mirrored is None else _minimise(problem, mirrored)
-    if snapshot.readout or _contradicts_readout(problem, snapshot, now):
-        problem = problem.with_readout()
-        now = _minimise(problem, problem.evaluate(_with_readout(now.state)))
+    if snapshot.readout or problem.J_readout.any():
+        with_readout = problem.with_readout()
+        begin = with_readout.evaluate(replace(now.state, common=np.append(now.state.common, 0.0)))
+        if snapshot.readout or _contradicts_readout(with_readout, snapshot, begin):
+            problem, now = with_readout, _minimise(with_readout, begin)
     return _result(problem, snapshot, now)
 
 
 def _contradicts_readout(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> bool:
     """Whether the views show another readout time than the declared one, by a step from the solution by that."""
-    if not problem.J_readout.any():
-        return False
-    problem = problem.with_readout()
-    now = problem.evaluate(_with_readout(now.state))
     widened, sources = _sources(problem, now)
     if sources is None:
         return False
@@ -102,10 +100,6 @@ def _contradicts_readout(problem: MapProblem, snapshot: Snapshot, now: Linearise
         return False
     std = math.sqrt(sources.variance_of_common(-1, widened, snapshot.errors))
     return FoundReadout(READOUT_STD * step, READOUT_STD * std).sigmas > CONTRADICTS
-
-
-def _with_readout(state: Poses) -> Poses:
-    return replace(state, common=np.append(state.common, 0.0))
 
 
 def _sources(problem: MapProblem, now: Linearised) -> tuple[float, ErrorSources | None]:
