@@ -129,16 +129,15 @@ class LensFit:
         """
         free, self._free = self._free, np.arange(len(self._prior))
         error = self.error(state)
-        information, _ = self._normal_equations(state, error, np.inf)
-        variance = float(np.sum(error**2)) / max(1, error.size - len(information))
         count = len(self._prior)
+        unknowns = count + 6 * len(state.T) + (state.places.size if self._board_std else 0)
+        variance = float(np.sum(error**2)) / max(1, error.size - unknowns)
+        information, _ = self._normal_equations(state, error, np.inf, 0.0, variance)
         to_prior, known = lens_prior(state.camera)
         information[MATRIX:count, MATRIX:count] += variance * known
-        self._add_board_prior(information, np.zeros(len(information)), state, variance)
         scale = np.sqrt(np.diag(information)) + 1e-12
         inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
-        weighted, gradient = self._normal_equations(state, error, _HUBER * _noise(error))
-        self._add_board_prior(weighted, gradient, state, variance)
+        _, gradient = self._normal_equations(state, error, _HUBER * _noise(error), 0.0, variance)
         gradient[MATRIX:count] -= variance * known @ to_prior
         change = (inverse @ gradient)[:count]
         self._free = free
@@ -190,9 +189,7 @@ class LensFit:
         noise = _noise(error)
         cost, damping = self._cost(state, error, noise), 1e-3
         for _ in range(_MAX_STEPS):
-            information, gradient = self._normal_equations(state, error, _HUBER * noise)
-            self._add_lens_prior(information, gradient, state, noise**2)
-            self._add_board_prior(information, gradient, state, noise**2)
+            information, gradient = self._normal_equations(state, error, _HUBER * noise, noise**2, noise**2)
             while damping < _MOST_DAMPED:
                 damped = information + damping * np.diag(np.diag(information) + 1e-12)
                 moved = self.moved(state, -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64))
@@ -219,8 +216,13 @@ class LensFit:
             prior += float(np.sum((state.places - self.described) ** 2)) / self._board_std**2
         return misfit + 0.5 * noise**2 * prior
 
-    def _normal_equations(self, state: FittedBoard, error: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
-        """Information and gradient without priors; errors beyond ``limit`` [px] count less."""
+    def _normal_equations(
+        self, state: FittedBoard, error: FloatArray, limit: float, of_lens: float, of_board: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Information and gradient; errors beyond ``limit`` [px] count less.
+
+        The priors of lens and board count as for residuals of the variances ``of_lens`` and ``of_board`` [px^2].
+        """
         weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-12))
         by_shared, by_pose, by_point = self.jacobian(state)
         views, shared = len(state.T), len(self._free)
@@ -236,9 +238,15 @@ class LensFit:
         of_poses[np.arange(views), :, np.arange(views)] = blocks[:, shared:, shared:]
         information[shared:, shared:] = of_poses.reshape(6 * views, 6 * views)
         gradient = np.concatenate([slopes[:, :shared, 0].sum(axis=0), slopes[:, shared:, 0].reshape(-1)])
+        prior = of_lens * self._prior[self._free]
+        information[range(shared), range(shared)] += prior
+        gradient[:shared] += prior * np.append(camera_parameters(state.camera), self._lacking)[self._free]
         if not self._board_std:
             return information, gradient
         own, cross, slope = self._board_equations(by_shared, by_pose, by_point, weight, error)
+        known = of_board / self._board_std**2
+        own[range(len(own)), range(len(own))] += known
+        slope += known * (state.places - self.described).reshape(-1)
         return np.block([[information, cross.T], [cross, own]]), np.concatenate([gradient, slope])
 
     def _board_equations(
@@ -258,25 +266,6 @@ class LensFit:
         by_poses = by_poses.reshape(points, views, 3, 6).swapaxes(1, 2).reshape(points, 3, -1)
         cross = np.concatenate([by_lens, by_poses], axis=2)
         return own.reshape(3 * points, -1), cross.reshape(3 * points, -1), slopes.reshape(-1)
-
-    def _add_lens_prior(
-        self, information: FloatArray, gradient: FloatArray, state: FittedBoard, variance: float
-    ) -> None:
-        """Add the prior of the coefficients, relative to residuals of ``variance`` [px^2]."""
-        shared, prior = len(self._free), variance * self._prior[self._free]
-        information[range(shared), range(shared)] += prior
-        gradient[:shared] += prior * np.append(camera_parameters(state.camera), self._lacking)[self._free]
-
-    def _add_board_prior(
-        self, information: FloatArray, gradient: FloatArray, state: FittedBoard, variance: float
-    ) -> None:
-        """Add the prior of the board's points, relative to residuals of ``variance`` [px^2]."""
-        if not self._board_std:
-            return
-        prior, first = variance / self._board_std**2, len(gradient) - state.places.size
-        unknowns = range(first, len(gradient))
-        information[unknowns, unknowns] += prior
-        gradient[first:] += prior * (state.places - self.described).reshape(-1)
 
     def _update_centroids(self, state: FittedBoard) -> float:
         """Update the centroids' offsets; returns the largest change [px]."""
