@@ -1,6 +1,6 @@
 """Calibration boards and their detection in raw frames: chessboard, circle grid, marker board."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -218,8 +218,7 @@ class MarkerBoard:
     def as_found(self, shape: BoardShape) -> MarkerMap:
         """The map of the board with its markers moved to where their corners were found."""
         moved = dict(self._board.markers)
-        for key, marker in self._markers.items():
-            corners = corners_in_map(marker.T_map_marker[None], np.array([marker.size]))[0]
+        for (key, marker), corners in zip(self._markers.items(), self._corners(self._markers), strict=True):
             places = np.stack([shape.found(corner) for corner in corners])
             moved[key] = replace(marker, T_map_marker=se3.rigid_alignment(places, corners) @ marker.T_map_marker)
         return replace(self._board, markers=moved)
@@ -229,7 +228,10 @@ class MarkerBoard:
         rows = rows[np.isin(rows['id'], list(self._markers))]
         if len(rows) < LEAST_MARKERS:
             raise BoardNotFound(f'{number_of(len(rows), "marker")} of the board, of which two are needed')
-        markers = [self._markers[marker_id] for marker_id in rows['id'].tolist()]
+        return Sighting(self._corners(rows['id'].tolist()).reshape(-1, 3), corners_px(rows).reshape(-1, 2))
+
+    def _corners(self, ids: Iterable[int]) -> FloatArray:
+        """Corners (N, 4, 3) of markers as described [m]."""
+        markers = [self._markers[marker_id] for marker_id in ids]
         T = np.stack([marker.T_map_marker for marker in markers])
-        points = corners_in_map(T, np.array([marker.size for marker in markers]))
-        return Sighting(points.reshape(-1, 3), corners_px(rows).reshape(-1, 2))
+        return corners_in_map(T, np.array([marker.size for marker in markers]))

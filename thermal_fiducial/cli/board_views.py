@@ -54,11 +54,7 @@ class BoardViews:
     def recognise(self, name: str, rows: Markers) -> Sighting | None:
         """The board among the detected markers of a frame; None as by :meth:`find`."""
         assert isinstance(self.target, MarkerBoard)
-        try:
-            return self.target.sighting(rows)
-        except BoardNotFound as reason:
-            self.leave(name, str(reason))
-            return None
+        return self._sighted(name, None, partial(self.target.sighting, rows))
 
     def find(self, frame: RawFrame, camera: Camera) -> Sighting | None:
         """The board in a frame; None if it is not found, and the reason is kept in ``unusable``."""
@@ -69,10 +65,14 @@ class BoardViews:
             return None
         self.size = (width, height)
         assert self.target is not None
+        return self._sighted(frame.name, frame.counts, partial(self.target.find, frame.counts, camera))
+
+    def _sighted(self, name: str, counts: Counts | Gray | None, look: Callable[[], Sighting]) -> Sighting | None:
+        """What ``look`` finds; None if that is no board, and the reason is kept."""
         try:
-            return self.target.find(frame.counts, camera)
+            return look()
         except BoardNotFound as reason:
-            self.leave(frame.name, str(reason), frame.counts)
+            self.leave(name, str(reason), counts)
             return None
 
     def keep(self, view: BoardView) -> None:

@@ -274,8 +274,8 @@ def test_a_board_that_is_not_as_described_does_not_bend_the_lens(name, model):
         assert abs(error[0]) < 1e-3 * lens.focal[0]
         # As the prior lets the board be anywhere, all of it may be moved and turned, and is measured by 20 views.
         order = [POINTS.tolist().index(point) for point in found.board.described.tolist()]
-        turn = turned_best(board[order] - board.mean(axis=0), found.board.places - found.board.places.mean(axis=0))
-        left = found.board.places - found.board.places.mean(axis=0) - (board[order] - board.mean(axis=0)) @ turn.T
+        T = se3.rigid_alignment(board[order], found.board.places)
+        left = se3.apply(T, found.board.places) - board[order]
         assert np.sqrt(np.mean(left**2)) < 0.3 * 5e-4
         exact.append(choose_model(views, 640, 512, [model])[0].camera.K[0, 0] / lens.focal[0] - 1.0)
     # Mean of 4 values of chi-square with 4 degrees of freedom: 4, with a deviation of 1.4; three of them.
