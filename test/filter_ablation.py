@@ -15,6 +15,7 @@ from support.filter_scenes import SCENES
 from support.taken_out import Mechanism, Study
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.evidence import ClockEvidence
 from thermal_fiducial.core.filter.pose_noise import LIMITS
 from thermal_fiducial.core.filter.update import body_pose
 
@@ -94,9 +95,13 @@ MECHANISMS = {
     'covariance in the clock of the IMU': Mechanism(
         ('slow and noisy', 'unknown clock at start'),
         ('update:_in_clock_of_imu',),
-        {'update:_in_clock_of_imu': lambda _, covariance, *__: covariance},
+        {'update:_in_clock_of_imu': lambda covariance, _: covariance},
     ),
-    'errors in variables': Mechanism(('slow and noisy',), off={'update:_SPURIOUS': 0.0}),
+    'errors in variables': Mechanism(
+        ('slow and noisy',),
+        ('evidence:ClockEvidence',),
+        {'evidence:ClockEvidence.after': lambda *_: ClockEvidence(1.0)},
+    ),
     'motion at a pose from 0.1 s': Mechanism(('slow and noisy',), off={'imu_buffer:_MOTION_SECONDS': 0.0}),
     'steps of the clock of the camera': Mechanism(
         ('stepping clock',), ('camera_clock:CameraClock',), {'camera_clock:CameraClock.proposed': _first(0)}

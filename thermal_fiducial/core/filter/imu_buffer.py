@@ -25,11 +25,15 @@ class Steps(NamedTuple):
 
 
 class LastSample(NamedTuple):
-    """The newest sample ``imu`` (6,); ``seconds`` and noise ``densities`` (6,) of the step that ends with it."""
+    """The newest sample ``imu`` (6,); ``seconds`` and noise ``densities`` (6,) of the step that ends with it.
+
+    ``white`` (2,): densities of the white noise of rate and force alone.
+    """
 
     imu: FloatArray
     seconds: float
     densities: FloatArray
+    white: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,15 +43,16 @@ class MotionAtPose:
     Attributes
     ----------
     imu : (6,) mean of equally many samples before and after it: a one-sided mean would bias the clock offset
-    rate_variance : white noise of one axis of the mean rate [rad^2/s^2]
-    velocity_variance : what accelerometer noise has added to the velocity since the last accepted pose [m^2/s^2]
+    rate_variance : variance of one axis of the mean rate [rad^2/s^2]
     turning : magnitude of the angular acceleration [rad/s^2]
+    white : (6,) variances by white noise alone, of the mean rate [rad^2/s^2] and of what that of the accelerometer has
+        added to the velocity since the last accepted pose [m^2/s^2]
     """
 
     imu: FloatArray
     rate_variance: float
-    velocity_variance: float
     turning: float
+    white: FloatArray
 
 
 class ImuBuffer:
@@ -59,29 +64,32 @@ class ImuBuffer:
         self._rows = np.zeros((_CAPACITY, 2, 6))
         #: stamps of the last sample and of the first one that is kept; 0 before the first
         self.newest_ns = self.oldest_ns = 0
-        self.last = LastSample(np.zeros(6), math.inf, np.zeros(6))
+        self.last = LastSample(np.zeros(6), math.inf, np.zeros(6), (0.0, 0.0))
 
     def __len__(self) -> int:
         """Number of samples."""
         return len(self._stamps_ns)
 
-    def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
-        """Add a sample (6,) and the noise densities (6,) of the step that ends with it; gaps are interpolated."""
+    def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray, white: tuple[float, float]) -> None:
+        """Add a sample (6,) and the noise densities (6,) of the step that ends with it; gaps are interpolated.
+
+        ``white``: densities of the white noise of rate and force alone.
+        """
         place = len(self._stamps_ns)
         if place == 0:
             self.oldest_ns = stamp_ns
         elif stamp_ns - self.newest_ns > GAP_NS:
-            self._fill_gap(stamp_ns, imu, densities)
+            self._fill_gap(stamp_ns, imu, densities, white)
             place = len(self._stamps_ns)
         if place == len(self._rows):
             self._rows = np.concatenate((self._rows, np.zeros_like(self._rows)))
         self._stamps_ns.append(stamp_ns)
         self._rows[place, 0], self._rows[place, 1] = imu, densities
         seconds = (stamp_ns - self.newest_ns) / SECOND_NS if place else math.inf
-        self.last = LastSample(imu, seconds, densities)
+        self.last = LastSample(imu, seconds, densities, white)
         self.newest_ns = stamp_ns
 
-    def _fill_gap(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
+    def _fill_gap(self, stamp_ns: int, imu: FloatArray, densities: FloatArray, white: tuple[float, float]) -> None:
         """Interpolate between the newest sample and the next one, ``imu`` (6,) at ``stamp_ns``.
 
         Over a gap the error of rate and force is noise, not a constant.
@@ -90,7 +98,7 @@ class ImuBuffer:
         parts = -((begin_ns - stamp_ns) // GAP_NS)
         for part in range(1, parts):
             part_ns = begin_ns + (stamp_ns - begin_ns) * part // parts
-            self.append(part_ns, begin + part / parts * (imu - begin), densities)
+            self.append(part_ns, begin + part / parts * (imu - begin), densities, white)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Remove samples before ``stamp_ns``, except the last one, which interpolation needs."""
@@ -137,11 +145,14 @@ class ImuBuffer:
         index = max(bisect_left(stamps_ns, time_ns), 1)
         seconds = (stamps_ns[index] - stamps_ns[index - 1]) / SECOND_NS
         each_side = max(min(round(_MOTION_SECONDS / seconds), len(stamps_ns) - index, index), 1)
-        samples = imu[index - each_side : index + each_side]
-        density = self._rows[index, 1]
+        first, end = index - each_side, index + each_side
+        # For as many steps as there are samples.
+        white_seconds = (stamps_ns[end - 1] - stamps_ns[first]) / SECOND_NS * (end - first) / (end - first - 1)
+        of_rate, of_force = self.last.white
+        since_accepted = (time_ns - accepted_ns) / SECOND_NS
         return MotionAtPose(
-            imu=samples.mean(axis=0),
-            rate_variance=float(density[0]) ** 2 / (seconds * len(samples)),
-            velocity_variance=float(density[3]) ** 2 * (time_ns - accepted_ns) / SECOND_NS,
+            imu=imu[first:end].mean(axis=0),
+            rate_variance=float(self._rows[index, 1, 0]) ** 2 / (seconds * (end - first)),
             turning=float(np.linalg.norm(imu[index, :3] - imu[index - 1, :3])) / seconds,
+            white=np.repeat((of_rate**2 / white_seconds, of_force**2 * since_accepted), 3),
         )

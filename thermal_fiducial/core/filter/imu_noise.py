@@ -75,6 +75,12 @@ class ImuNoiseMonitor:
         """Densities of the floor of the vibration's spectrum [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]."""
         return self._floor.densities
 
+    @property
+    def white(self) -> tuple[float, float]:
+        """Densities of the white noise alone [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]."""
+        rate, force = self._floor.densities
+        return max(self._sheet[0], self._noise.vibration * rate), max(self._sheet[1], self._noise.vibration * force)
+
     def densities(self, imu: FloatArray, seconds: float) -> FloatArray:
         """(6,) densities for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
         self._floor.add(imu, seconds)
@@ -85,13 +91,12 @@ class ImuNoiseMonitor:
         values = imu.tolist()
         rates, forces = values[:3], values[3:]
         motions = math.hypot(*rates), self._motion_of(forces, seconds)
-        squares = []
+        white, squares = self.white, []
         for triad, (readings, motion) in enumerate(zip((rates, forces), motions, strict=True)):
-            white = max(self._sheet[triad], self._noise.vibration * self._floor.densities[triad]) ** 2
             moving = (self._nonlinearity[triad] * motion) ** 2 * _MOTION_TIME
             beyond = max(map(abs, readings)) >= self._ranges[triad]
             lost = _SATURATED[triad] ** 2 * seconds if beyond else 0.0
-            squares.append(white + moving + between[triad] + max(lost, self._saturated[triad]))
+            squares.append(white[triad] ** 2 + moving + between[triad] + max(lost, self._saturated[triad]))
             self._saturated[triad] = lost
         rate, force = map(math.sqrt, squares)
         return np.array((rate, rate, rate, force, force, force))

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.filter.mount import MountEvidence
+from thermal_fiducial.core.filter.evidence import ClockEvidence, MountEvidence
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
 from thermal_fiducial.core.geometry.reprojection import lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_left_jacobian, transform
@@ -144,6 +144,7 @@ class Estimate:
     #: noise of the camera poses, as adapted to the innovations
     pose_noise: PoseNoise
     mount: MountEvidence = field(default_factory=MountEvidence)
+    clock: ClockEvidence = field(default_factory=ClockEvidence)
 
     def widened(self, error: FloatArray, std: float) -> 'Estimate':
         """The estimate with an unknown multiple of an ``error`` (54,), of standard deviation ``std``."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.evidence import ClockEvidence
 from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
 from thermal_fiducial.core.filter.pose_noise import (
@@ -16,7 +17,6 @@ from thermal_fiducial.core.filter.pose_noise import (
     share_that_stays,
 )
 from thermal_fiducial.core.filter.state import (
-    clock_offset_derivative,
     CORE,
     embedded_core,
     Estimate,
@@ -35,12 +35,8 @@ from thermal_fiducial.core.filter.state import (
 from thermal_fiducial.core.geometry.reprojection import lever_arm
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian, so3_log
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, TINY
 
-#: The derivative of a pose by the clock offset is a measured motion. Its noise n adds spurious information about the
-#: offset, 1 to 2 times n' diag(S^-1) n, growing with the gain. It is taken away; the offset's variance at most doubles
-#: in one step.
-_SPURIOUS, _LEAST_KEPT = 1.5, 0.5
 #: Share of ``lost_position_std`` that an estimate may give up to go on in the map of worse markers. Up to 0.2 random
 #: rigs are alike, with 0.35 one of them is lost. Were it to give up nothing, the IMU would decide between maps that
 #: hardly differ.
@@ -161,18 +157,19 @@ def with_covariance(config: PoseEkfConfig, innovation: Innovation, covariance: F
 def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
     """The estimate after an accepted pose."""
     prior, before = innovation.prior, innovation.derivative
-    gain, covariance = _gained(innovation)
+    clock = _clock_evidence(innovation)
+    gain, covariance = _gained(innovation, clock.share_of_motion)
     error = _iterated(innovation, gain)
     state = prior.state.plus(error)
     if config.estimate_time_offset:
         now = state.derivative(innovation.motion.imu)
         state = state.moved((before - now) * error[TIME_OFFSET])
-        covariance = _in_clock_of_imu(config, covariance, now, innovation)
+        covariance = _in_clock_of_imu(covariance, before - now)
     last = innovation.pose.after(prior.pose_noise.last, state.T_map_body)
     noise = replace(adapted_noise(innovation), last=last, of_map=prior.pose_noise.of_map)
     by_rotation = innovation.H @ innovation.of_extrinsics[:, :3]
     mount = prior.mount.after(by_rotation, innovation.S_exact, innovation.value)
-    return replace(prior, state=state, covariance=covariance, pose_noise=noise, mount=mount)
+    return replace(prior, state=state, covariance=covariance, pose_noise=noise, mount=mount, clock=clock)
 
 
 def adapted_noise(innovation: Innovation) -> PoseNoise:
@@ -262,47 +259,67 @@ def _second_order_of_clock(prior: Estimate, motion: MotionAtPose, derivative: Fl
     return R
 
 
-def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, innovation: Innovation) -> FloatArray:
-    """The covariance after an update that changed the core's derivative to ``now`` (9,).
+def _in_clock_of_imu(P: FloatArray, followed: FloatArray) -> FloatArray:
+    """The covariance after an update that changed the core's derivative by ``-followed`` (9,).
 
     A pose measures the state at the camera's stamp, X(t) Exp(derivative s). The error of that state does not depend on
     the linearisation point of the derivative, so the error of X(t) is shifted with it; otherwise each correction of the
     velocity would add spurious information about the offset s. (G. Huang, A. Mourikis, S. Roumeliotis,
     "Observability-based Rules for Designing Consistent EKF SLAM Estimators", IJRR 2010, keep other unobservable
     directions in the same way.)
-
-    Noise of the derivative adds spurious information, too (errors in variables), which is taken away again.
     """
-    with_offset, motion = P[TIME_OFFSET], innovation.motion
-    variance = float(with_offset[TIME_OFFSET])
-    followed = innovation.derivative - now
-    half = np.outer(followed, with_offset + 0.5 * variance * embedded_core(followed))
-    noise = np.repeat((motion.rate_variance, motion.velocity_variance), 3)
-    spurious = _SPURIOUS * float(np.linalg.inv(innovation.S_exact).diagonal() @ noise)
-    widest = max(variance, config.time_offset_std**2)
-    consistent = min(variance / max(1.0 - variance * spurious, _LEAST_KEPT), widest)
-    by_offset = clock_offset_derivative(now)
-    P = P + (consistent - variance) * np.outer(by_offset, by_offset)
+    with_offset = P[TIME_OFFSET]
+    half = np.outer(followed, with_offset + 0.5 * with_offset[TIME_OFFSET] * embedded_core(followed))
+    P = P.copy()
     P[CORE] += half
     P[:, CORE] += half.T
     return P
 
 
-def _gained(innovation: Innovation) -> tuple[FloatArray, FloatArray]:
+def _clock_evidence(innovation: Innovation) -> ClockEvidence:
+    """What this and the latest poses say of the clock offset.
+
+    The derivative of a pose by the offset is a measured motion. Its white noise, of covariance N, adds spurious
+    information (errors in variables): at once tr(S^-1 N), and by what the state has taken up of the noise at earlier
+    poses. With the gain G = 1 - R S^-1 of a pose on itself that is G / (2 - G) times as much, in all
+    2 tr((S + R)^-1 N).
+    """
+    S = innovation.S_exact
+    seen = _exact_covariance(innovation)[TIME_OFFSET] @ innovation.H.T
+    variance = float(innovation.prior.covariance[TIME_OFFSET, TIME_OFFSET])
+    information = float(seen @ np.linalg.solve(S, seen)) / max(variance, TINY) ** 2
+    spurious = 2.0 * float(np.linalg.inv(S + innovation.R).diagonal() @ innovation.motion.white)
+    return innovation.prior.clock.after(information, spurious)
+
+
+def _exact_covariance(innovation: Innovation) -> FloatArray:
+    """Covariance (54, 54) of the prior if the extrinsics were exact."""
+    of_extrinsics = innovation.of_extrinsics
+    exact = innovation.prior.covariance - of_extrinsics @ of_extrinsics.T
+    # Where rounding leaves variances below zero, they would grow with each update.
+    exact[EXTRINSICS], exact[:, EXTRINSICS] = 0.0, 0.0
+    return np.asarray(exact)
+
+
+def _gained(innovation: Innovation, share_of_motion: float) -> tuple[FloatArray, FloatArray]:
     """Kalman update: the gain (54, 6) and the covariance (54, 54).
 
     The gain is that of exact extrinsics, so the estimate does not depend on how well they are said to be known; the
     covariance has all that their errors do to it.
+
+    ``share_of_motion``: of the information about the clock offset, the rest is that of noise. The offset is corrected
+    by that share, the best linear estimate, and its variance falls by the square of it: the noise is in what the
+    correction adds, and not in what it takes away.
     """
     algebra, of_extrinsics = copy(_ALGEBRA), innovation.of_extrinsics
-    exact = innovation.prior.covariance - of_extrinsics @ of_extrinsics.T
-    # Where rounding leaves variances below zero, they would grow with each update.
-    exact[EXTRINSICS], exact[:, EXTRINSICS] = 0.0, 0.0
-    algebra.x, algebra.P = np.zeros(SIZE), exact
+    algebra.x, algebra.P = np.zeros(SIZE), _exact_covariance(innovation)
     algebra.update(innovation.value, lambda _: innovation.H, lambda _: np.zeros(6), R=innovation.R)
-    of_extrinsics = of_extrinsics - algebra.K @ (innovation.H @ of_extrinsics)
-    covariance = 0.5 * (algebra.P + algebra.P.T) + of_extrinsics @ of_extrinsics.T
-    return algebra.K, covariance
+    gain, covariance = algebra.K, 0.5 * (algebra.P + algebra.P.T)
+    by_pose = gain[TIME_OFFSET] @ innovation.S_exact @ gain[TIME_OFFSET]
+    covariance[TIME_OFFSET, TIME_OFFSET] += (1.0 - share_of_motion**2) * by_pose
+    gain[TIME_OFFSET] *= share_of_motion
+    of_extrinsics = of_extrinsics - gain @ (innovation.H @ of_extrinsics)
+    return gain, covariance + of_extrinsics @ of_extrinsics.T
 
 
 def _iterated(innovation: Innovation, gain: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from support.flights import config, Flight, run, timeline
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.filter.mount import MountEvidence
+from thermal_fiducial.core.filter.evidence import MountEvidence
 from thermal_fiducial.core.geometry.se3 import camera_in_body, quaternion_from_rotation, so3_exp
 
 STD = 0.005
