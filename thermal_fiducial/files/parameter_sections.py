@@ -18,7 +18,7 @@ def load_sections(path: Path) -> dict[str, dict[str, Any]]:
     Raises
     ------
     InputError
-        Unreadable, or not the form of such a file.
+        Unreadable, not the form of such a file, or a parameter that is there twice.
     """
     document = load_plain(path)
     if not isinstance(document, dict) or not document:
@@ -63,9 +63,19 @@ def _sections(path: Path, document: Mapping[str, Any], namespace: str) -> Iterat
         if _PARAMETERS not in content:
             yield from _sections(path, content, f'{namespace}{name}/')
         elif isinstance(content[_PARAMETERS], dict):
-            yield f'{namespace}{name}', dict(_flat(content[_PARAMETERS], ''))
+            yield f'{namespace}{name}', _joined_by_dots(path, content[_PARAMETERS])
         else:
             raise _no_parameters(path)
+
+
+def _joined_by_dots(path: Path, section: Mapping[str, Any]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for name, value in _flat(section, ''):
+        if name in values:
+            # As where the result of a calibration was added to a copy of the package's file.
+            raise InputError(f'parameter file {path}: {shown(name)} is there twice, once nested')
+        values[name] = value
+    return values
 
 
 def _flat(section: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:

@@ -1,6 +1,7 @@
 """The parameter file of the package is the one that the config dataclasses make."""
 
 from pathlib import Path
+import re
 
 import pytest
 from support.empty_stage import finished
@@ -111,9 +112,9 @@ def test_nodes_of_others_may_have_names_like_ours(tmp_path, section, values):
 def test_the_node_whose_section_is_mistyped_warns_of_it(tmp_path):
     file = tmp_path / 'rig.yaml'
     file.write_text(yaml.safe_dump({'pose_efk': {'ros__parameters': {'gate': 30.0}}}))
-    (line,) = params.ignored_for('/pose_ekf', ['node', '--ros-args', '--params-file', str(file), '-r', 'a:=b'])
+    (line,) = params.doubts_of_files('/pose_ekf', ['node', '--ros-args', '--params-file', str(file), '-r', 'a:=b'])
     assert line == f'{file}: section pose_efk: no node of ours is called so; did you mean pose_ekf?'
-    assert not [*params.ignored_for('/tau2_camera', ['--ros-args', '--params-file', str(file)])]
+    assert not [*params.doubts_of_files('/tau2_camera', ['--ros-args', '--params-file', str(file)])]
     program = """
 import os, signal, sys
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
@@ -128,6 +129,26 @@ sys.exit(run.run(Stopped))
 """
     done = finished(program, '--ros-args', '--params-file', str(file))
     assert (done.returncode, line in done.stderr, line in done.stdout) == (0, True, True), done.stdout + done.stderr
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ('added', 'what'),
+    [
+        ('    camera_position: [0.0, 0.0, 0.0]\n', "line 5: 'camera_position' is there twice"),
+        ('/**:\n  ros__parameters:\n    gate: 30.0\n', "line 5: '/**' is there twice"),
+        ('    imu: {gyroscope_noise_density: 0.001}\n', 'imu.gyroscope_noise_density is there twice, once nested'),
+    ],
+)
+def test_a_node_warns_of_what_its_file_has_twice(tmp_path, added, what):
+    """ROS takes the last of two without a word: a default from the copied file instead of a calibration, say."""
+    file = tmp_path / 'rig.yaml'
+    of_copy = '    camera_position: [0.12, 0.02, -0.04]\n    imu.gyroscope_noise_density: 0.00017\n'
+    file.write_text(f'/**:\n  ros__parameters:\n{of_copy}{added}')
+    (line,) = params.doubts_of_files('/pose_ekf', ['node', '--ros-args', '--params-file', str(file)])
+    assert f'{file}: {what}: ROS reads the file all the same' in line
+    with pytest.raises(InputError, match=f'{re.escape(what)}$'):
+        read_settings(file, {})
 
 
 def test_namespaces_may_be_nested_as_in_ros(tmp_path):
@@ -181,9 +202,9 @@ def test_a_section_without_the_namespace_of_its_node_is_warned_of(tmp_path, sect
     why = 'ROS ignores it, as it is for a node without a namespace'
     line = f'{file}: section {section}: {why}; for /drone/pose_ekf write /drone/pose_ekf or /**/pose_ekf'
     given = ['node', '--ros-args', '--params-file', str(file)]
-    assert [*params.ignored_for('/drone/pose_ekf', given)] == [line] * ignored
-    assert not [*params.ignored_for('/pose_ekf', given)]
-    assert not [*params.ignored_for('/drone/tau2_camera', given)]
+    assert [*params.doubts_of_files('/drone/pose_ekf', given)] == [line] * ignored
+    assert not [*params.doubts_of_files('/pose_ekf', given)]
+    assert not [*params.doubts_of_files('/drone/tau2_camera', given)]
 
 
 @pytest.mark.ros

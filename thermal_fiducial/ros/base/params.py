@@ -1,7 +1,6 @@
 """ROS parameters from the config dataclasses: declaration with descriptor, validation, dynamic changes."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import Field
 from itertools import pairwise
 from pathlib import Path
@@ -52,11 +51,12 @@ def declare(node: Node, kind: type[Config]) -> Config:
     return from_mapping(kind, current_values(node, kind))
 
 
-def ignored_for(node: str, args: Sequence[str]) -> Iterator[str]:
-    """A warning for each section of the parameter files in ``args`` that is meant for ``node``, but ignored by ROS.
+def doubts_of_files(node: str, args: Sequence[str]) -> Iterator[str]:
+    """A warning for each of the parameter files in ``args`` that a replay refuses, as it has a parameter twice.
 
-    A node that was given another name has none: only who gave it knows how it is spelt. Nor has one of a second camera
-    for sections without a namespace, which are for the first.
+    And for each section in them that is meant for ``node``, but ignored by ROS. A node that was given another name has
+    none: only who gave it knows how it is spelt. Nor has one of a second camera for sections without a namespace, which
+    are for the first.
 
     Parameters
     ----------
@@ -66,9 +66,11 @@ def ignored_for(node: str, args: Sequence[str]) -> Iterator[str]:
     namespace, _, name = node.rpartition('/')
     files: dict[str, dict[str, dict[str, Any]]] = {}
     for file in (value for flag, value in pairwise(args) if flag == '--params-file'):
-        # ROS has read the file; what we would refuse in it is not refused here.
-        with suppress(InputError):
+        try:
             files[file] = load_sections(Path(file))
+        except InputError as error:
+            # ROS has read the file: a node that starts again in flight must not end for it.
+            yield f'{error}: ROS reads the file all the same, and of two takes the last'
     seconds = {values.get('second_camera') for sections in files.values() for values in sections.values()}
     is_second = namespace.rpartition('/')[2] in seconds
     for file, sections in files.items():

@@ -167,7 +167,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             _refuse_others(args)
             node = _made(make_node)
             ending.callback(node.destroy_node)
-            node.remark(params.ignored_for(node.get_fully_qualified_name(), sys.argv if args is None else args))
+            node.remark(params.doubts_of_files(node.get_fully_qualified_name(), sys.argv if args is None else args))
             executor = make_executor()
             ending.callback(executor.shutdown)
             ending.push(limit_the_end)
