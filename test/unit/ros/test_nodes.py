@@ -712,7 +712,8 @@ def test_a_reset_is_logged_with_its_reason_and_then_the_recovery(graph, capfd):
     assert lines == [
         'initialised: tracking',
         'reset: the poses contradict the estimate and agree with each other; if in fast motion: camera_time_offset, '
-        'readout_time, bolometer_lag? if again and again: axes, sign, units of the IMU, marker_size?',
+        'readout_time, bolometer_lag? if again and again: axes, sign, units of the IMU, camera_position, '
+        'camera_orientation, marker_size?',
         'reset: on request',
         'waiting for markers',
         'recovered: tracking',

@@ -32,8 +32,8 @@ NEVER = -(1 << 62)
 _KEPT, _NIS_POSES = 300, 30
 #: Reasons of a reset. In fast motion poses are off together by a clock, a line readout or a lag not as declared; an IMU
 #: with wrong axes passes for a good one at rest, and contradicts all poses as soon as the robot moves, and so do poses
-#: of another scale.
-_AGAIN = 'if again and again: axes, sign, units of the IMU, marker_size?'
+#: of another scale, and those of a camera that is elsewhere on the robot.
+_AGAIN = 'if again and again: axes, sign, units of the IMU, camera_position, camera_orientation, marker_size?'
 OUTVOTED = (
     'the poses contradict the estimate and agree with each other; if in fast motion: camera_time_offset, '
     f'readout_time, bolometer_lag? {_AGAIN}'

@@ -132,9 +132,8 @@ def _contradiction(config: PoseEkfConfig, hypothesis: Hypothesis, innovation: In
         apart = f'{math.degrees(np.linalg.norm(turn)):.0f} deg apart after {seconds:.2f} s'
         return Condition('poses contradict the gyroscope', f'{apart}; its units, axes, sign? camera_orientation?')
     apart = f'{np.linalg.norm(shift):.2f} m apart after {seconds:.2f} s'
-    return Condition(
-        'poses contradict the accelerometer, or each other', f'{apart}; its units, axes, sign? marker_size?'
-    )
+    causes = 'its units, axes, sign? camera_position? marker_size?'
+    return Condition('poses contradict the accelerometer, or each other', f'{apart}; {causes}')
 
 
 def passes_with_unknown_clock(config: PoseEkfConfig, innovation: Innovation) -> bool:

@@ -88,7 +88,8 @@ def test_poses_that_contradict_the_estimate_and_agree_reset_it():
     # clock that is 0.3 s off.
     assert belief.reset_reason == (
         'the poses contradict the estimate and agree with each other; if in fast motion: camera_time_offset, '
-        'readout_time, bolometer_lag? if again and again: axes, sign, units of the IMU, marker_size?'
+        'readout_time, bolometer_lag? if again and again: axes, sign, units of the IMU, camera_position, '
+        'camera_orientation, marker_size?'
     )
 
 
@@ -121,7 +122,7 @@ def test_an_estimate_that_is_lost_is_replaced_by_the_fewest_poses():
     lost = Belief(main=hypothesis(1.01, hits=30), alternative=begun, hits_before=30)
     assert lost.settled(CONFIG).reset_reason == (
         'the pose was lost, and poses agree with each other; '
-        'if again and again: axes, sign, units of the IMU, marker_size?'
+        'if again and again: axes, sign, units of the IMU, camera_position, camera_orientation, marker_size?'
     )
     known = lost._replace(main=hypothesis(0.99, hits=30))
     assert known.settled(CONFIG) is known

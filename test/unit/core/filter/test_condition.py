@@ -129,3 +129,12 @@ def test_a_gyroscope_of_wrong_sign_is_named_also_after_the_start():
     run(ekf, timeline(samples[:RATE] + wrong, flight.poses))
     assert ekf.resets > 1
     assert 'axes, sign, units of the IMU' in ekf.reset_reason
+
+
+def test_a_camera_at_the_wrong_place_of_the_robot_is_named_by_the_reset():
+    """The pose is off by as much as the camera, and passes as long as the robot does not turn."""
+    flight = Flight(seed=1, seconds=8.0)
+    ekf = PoseEkf(replace(CONFIG, camera_position=tuple(-x for x in CONFIG.camera_position)))
+    run(ekf, timeline(flight.samples(), flight.poses))
+    assert ekf.resets > 0
+    assert 'camera_position' in ekf.reset_reason
