@@ -610,7 +610,7 @@ def test_a_queue_of_imu_messages_is_taken_in_at_once_with_one_pose_at_the_newest
 
 
 def test_stamps_that_go_back_are_reported_and_the_next_ones_used(graph):
-    node = graph.add(PoseEkfNode)
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
     fly(graph, [imu(10), imu(11), imu(9)])
     level, reason, _ = graph.diagnose(node)
     assert level != OK
@@ -659,7 +659,7 @@ def test_an_input_without_messages_is_reported(graph):
 
 
 def test_an_input_that_stops_is_an_error_after_two_seconds(graph):
-    node = graph.add(PoseEkfNode)
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
     fly(graph, [imu(0)])
     levels = [graph.diagnose(node)[:2] for _ in range(3)]
     assert levels[1:] == [(WARN, 'nothing on imu/data'), (ERROR, 'nothing on imu/data')]

@@ -124,6 +124,37 @@ def test_parameters_hold_where_that_is_asked_for(graph, capfd):
 
 
 @pytest.mark.ros
+@pytest.mark.parametrize('extrinsics', ['auto', 'parameters'])
+@pytest.mark.parametrize('kind', [ArucoDetector, MarkerMapperNode, LandingTarget, PoseEkfNode])
+def test_a_camera_whose_place_was_never_given_is_named(graph, kind, extrinsics, capfd):
+    """The robot flew 0.13 m off, without a word until it turned."""
+    node = graph.add(kind, extrinsics=extrinsics)
+    graph.diagnose(node)
+    assert 'camera_position is [0, 0, 0], the default: poses are off by as much' in capfd.readouterr().err
+    given = graph.add(kind, extrinsics=extrinsics, camera_position=[0.0, 0.0, 0.001])
+    graph.diagnose(given)
+    assert 'the default' not in capfd.readouterr().err
+
+
+@pytest.mark.ros
+def test_it_is_in_the_diagnostics_of_the_filter_until_something_says_where(graph):
+    node = graph.add(PoseEkfNode)
+    graph.send('imu/data', imu(0))
+    level, reason, _ = graph.diagnose(node)
+    assert level >= WARN
+    assert 'camera_position is [0, 0, 0]' in reason
+    graph.send('robot_description', String(data=URDF), profile=qos.LATCHED)
+    assert 'camera_position' not in graph.diagnose(node)[1]
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('place', [[0.0, 0.0, 0.0], [0.0, 0.0, -0.05]])
+def test_so_is_a_second_camera(graph, place):
+    node = graph.add(MarkerMapperNode, second_camera='down', second_camera_position=place)
+    assert any('second_camera_position is [0, 0, 0]' in line for line in node.remarks) == (not any(place))
+
+
+@pytest.mark.ros
 def test_a_broken_description_is_refused_and_the_node_lives(graph):
     node = graph.add(PoseEkfNode)
     graph.send('imu/data', imu(0))

@@ -3,6 +3,7 @@
 They are far beyond anything real, and small enough that squares and products of accepted values stay finite.
 """
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -137,6 +138,13 @@ def doubt_of_resolution(camera: 'Camera') -> str:
     u, v = camera.principal_point
     centre = f'principal point ({u:.0f}, {v:.0f}) in images of {camera.width}x{camera.height} pixels'
     return f'camera_info: {centre}: is the calibration of another resolution?'
+
+
+def doubt_of_place(name: str, position: Sequence[float]) -> str:
+    """Warning if a camera's ``position`` [m] in the IMU's frame was left at its default, which none has; else empty."""
+    if any(position):
+        return ''
+    return f'{name} is [0, 0, 0], the default: poses are off by as much as the camera is away from the IMU'
 
 
 def _require_invertible(camera: 'Camera') -> None:

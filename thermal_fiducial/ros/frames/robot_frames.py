@@ -10,6 +10,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_msgs.msg import String
 
+from thermal_fiducial.core.geometry.plausibility import doubt_of_place
 from thermal_fiducial.core.geometry.se3 import camera_in_body, inverse, quaternion_from_rotation, rotation_angle
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
@@ -55,6 +56,7 @@ class RobotFrames:
         if node.config.extrinsics == 'parameters':
             self.decided = True
             self._say()
+            self._name_doubt()
             return
         node.subscribe(String, 'robot_description', self._on_description, qos.LATCHED)
         try:
@@ -66,6 +68,8 @@ class RobotFrames:
         if node.live:
             clock = Clock(clock_type=ClockType.STEADY_TIME)
             self._timer = node.create_timer(_PATIENCE, self._give_up, clock=clock)
+        else:
+            self._name_doubt()
 
     @property
     def parameters_hold(self) -> bool:
@@ -74,9 +78,11 @@ class RobotFrames:
 
     @property
     def doubt(self) -> str:
-        """That TF or the URDF, which have the camera, do not know the IMU's frame; empty if they do, or have no say."""
+        """That nothing says where the camera is, or that what says it does not know the IMU's frame; else empty."""
         frame, base = self._imu_frame, self._node.config.base_frame
-        if not self.decided or self.source == _PARAMETERS or not frame or self._is_on_robot(frame):
+        if self.parameters_hold:
+            return doubt_of_place('camera_position', self._node.config.camera_position)
+        if not self.decided or not frame or self._is_on_robot(frame):
             return ''
         return f'IMU in frame {frame[:_LONGEST_NAME]!r}, not connected with {base} by {self.source}: taken for {base}'
 
@@ -135,7 +141,7 @@ class RobotFrames:
 
     def _name_doubt(self) -> None:
         if self.doubt:
-            self._node.console.event('imu', self.doubt)
+            self._node.console.event('frames', self.doubt)
 
     def _take(self, source: str, T_body_camera: FloatArray, T_imu_base: FloatArray | None, *, moved: bool) -> None:
         if T_imu_base is not None and not np.abs(T_imu_base[:3, 3]).max() < _FARTHEST:

@@ -8,6 +8,7 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import covariance_of_mount
+from thermal_fiducial.core.geometry.plausibility import doubt_of_place
 from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.second_camera import SecondCamera
@@ -42,6 +43,8 @@ class CameraPoses:
         self._reason = ''
         name = node.config.second_camera
         if name:
+            doubt = doubt_of_place('second_camera_position', node.config.second_camera_position)
+            node.remark(filter(None, [doubt]))
             self._second = _second_of(node.config)
             self._locator = MarkerMapper(_alone(node.config), mapper.map)
             node.subscribe_newest(PointCloud2, f'{name}/markers', self._on_second, qos.RESULT, raw=True)
