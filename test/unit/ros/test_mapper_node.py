@@ -109,6 +109,25 @@ def test_a_calibration_that_does_not_fit_the_map_is_doubted(graph, tmp_path, foc
     assert (float(figures['misfit [sigma]']) > 1.5) == doubted
 
 
+@pytest.mark.parametrize('at', [0.0, 2.0], ids=['two poses', 'no pose'])
+@pytest.mark.parametrize('unit', [1.0, 1.0 / 0.0254])
+def test_a_map_in_other_units_is_doubted_though_frames_allow_two_poses_or_none(graph, tmp_path, capfd, unit, at):
+    """Only located frames counted: of a map in inches the console was silent, and poses were 140 m off."""
+    rng = np.random.default_rng(2)
+    poses = walls.wall(rng)
+    written = {key: transform(T[:3, :3], unit * T[:3, 3]) for key, T in poses.items()}
+    markers = {key: MapMarker(key, walls.SIZE, True, T) for key, T in written.items()}
+    save_map(tmp_path / 'map.yaml', MarkerMap(markers))
+    node = graph.add(MarkerMapperNode, map_file=str(tmp_path / 'map.yaml'), mode='localization')
+    graph.send('thermal/camera_info', info(walls.CAMERA))
+    for k in range(30):
+        rows = walls.see(walls.flight(at), poses, 0.05, rng)
+        graph.send('markers', clouds.cloud(rows, convert.header(START + k * 33_333_333, 'camera')))
+    level, reason, _ = graph.diagnose(node)
+    said = 'corners are not where map and calibration have them'
+    assert (said in reason, said in capfd.readouterr().err, level == WARN) == (unit > 1.0,) * 3
+
+
 def test_a_rolling_shutter_that_is_not_as_declared_is_named(graph, map_file):
     node = graph.add(MarkerMapperNode, map_file=str(map_file))
     assert node.headline() == ''

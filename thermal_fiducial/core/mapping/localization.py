@@ -76,7 +76,7 @@ def locate(
         # A marker that the camera could not show is not where the map has it. The others give the pose, if most are.
         if 2 * np.count_nonzero(shown) > len(shown):
             return locate(stamp_ns, sight.only(shown), camera, model, odometry, last)
-        return Refusal(f'no camera pose explains {names(sight)}')
+        return Refusal(f'no camera pose explains {names(sight)}', compared=(sight, reprojection))
     # Steps 5 and 6: refined with the weights of their errors.
     found = frame.refined(T, reprojection, frame.weights(reprojection, by_map))
     if found is None:
@@ -143,7 +143,8 @@ def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPo
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
     likelier, less_likely = (found, second) if chi2[0] <= chi2[1] else (second, found)
     pose = _mean(likelier, less_likely)
-    return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', both, pose=pose)
+    why = f'planar ambiguity of {names(frame.sight)} unsettled'
+    return Refusal(why, both, pose=pose, compared=likelier.compared)
 
 
 def _mean(likelier: Location, less_likely: Location) -> CameraPose:

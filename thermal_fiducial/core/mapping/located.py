@@ -123,6 +123,11 @@ class Location:
     settled: bool = True
 
     @property
+    def compared(self) -> tuple[Sight, Reprojected]:
+        """The markers, re-projected."""
+        return self.sight, self.reprojection
+
+    @property
     def rotation_std(self) -> float:
         """Standard deviation of the attitude [rad]."""
         return math.sqrt(self.pose.covariance[3:, 3:].trace())
@@ -187,6 +192,8 @@ class Refusal:
     pose: CameraPose | None = None
     #: where that is the reason
     misplaced: MisplacedMarker | None = None
+    #: where a pose was found that is not published alone: the markers re-projected at it, NaN behind the camera
+    compared: tuple[Sight, Reprojected] | None = None
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from statistics import median
 
 import numpy as np
 
-from thermal_fiducial.core.mapping.located import error_std_px, LocatedFrame, Location
+from thermal_fiducial.core.mapping.located import error_std_px, LocatedFrame
 from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
 from thermal_fiducial.core.wording import listed
 from thermal_fiducial.ros.base.node import OK, WARN
@@ -31,11 +31,11 @@ class Misfit:
         self._squares: deque[float] = deque(maxlen=_FRAMES)
 
     def add(self, frame: LocatedFrame) -> None:
-        """Take in a frame, if it was located."""
-        if isinstance(frame.outcome, Location):
-            sight, reprojection = frame.outcome.sight, frame.outcome.reprojection
+        """Take in a frame, if a pose was found, be it one of two, or one with markers behind the camera."""
+        if frame.outcome.compared is not None:
+            sight, reprojection = frame.outcome.compared
             ratios = reprojection.errors_px / error_std_px(sight, reprojection, _EXACT)
-            self._squares.append(float(ratios @ ratios) / len(ratios))
+            self._squares.append(float(np.nan_to_num(ratios @ ratios, nan=math.inf)) / len(ratios))
 
     @property
     def sigma(self) -> float:
