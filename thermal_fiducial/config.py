@@ -25,6 +25,8 @@ _OF_ROS = ('use_sim_time', 'start_type_description_service')
 QOS_OVERRIDES = 'qos_overrides.'
 #: 99.9 % quantile of chi square with six degrees of freedom, of a pose: beyond it two poses contradict each other.
 CHI2_OF_POSE = 22.5
+#: Range of a marker's side [m].
+SMALLEST_SIDE, LARGEST_SIDE = 0.005, 10.0
 #: Largest ``keyframe_budget``.
 MOST_KEYFRAMES = 20_000
 
@@ -245,18 +247,27 @@ def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
     Raises
     ------
     InputError
-        An entry of another form, or a side that is not positive.
+        An entry of another form, or a side that no marker has.
     """
     sizes: dict[int, float] = {}
     for entry in entries:
         marker_id, _, size = entry.partition(':')
         try:
-            sizes[int(marker_id)] = float(size)
+            key, side = int(marker_id), float(size)
         except ValueError:
             raise InputError(f'parameter marker_size_overrides: {_shown(entry)} is not "ID:SIZE"') from None
-        if not 0.0 < sizes[int(marker_id)] < 100.0:
-            raise InputError(f'parameter marker_size_overrides: {_shown(entry)} has no usable size')
+        if not SMALLEST_SIDE <= side <= LARGEST_SIDE:
+            allowed = f'{SMALLEST_SIDE} .. {LARGEST_SIDE} m'
+            raise InputError(f'parameter marker_size_overrides: the side of {_shown(entry)} is outside {allowed}')
+        sizes[key] = side
     return sizes
+
+
+def _refuse_two_sides(entries: tuple[str, ...]) -> None:
+    """Raise InputError for a marker with two sides, and as :func:`size_overrides`, where the last of two counts."""
+    ids = [marker_id for entry in entries for marker_id in size_overrides((entry,))]
+    if twice := sorted({marker_id for marker_id in ids if ids.count(marker_id) > 1}):
+        raise InputError(f'parameter marker_size_overrides: marker {twice[0]} is there twice')
 
 
 def _refuse_no_namespace(name: str) -> None:
@@ -328,9 +339,11 @@ class MarkerParameters(SelfChecked):
         '"markers make"), or the path of a dictionary file.',
         form=from_home,
     )
-    marker_size: float = param(0.30, 'Side of the black square of a marker.', unit='m', minimum=0.005, maximum=10.0)
+    marker_size: float = param(
+        0.30, 'Side of the black square of a marker.', unit='m', minimum=SMALLEST_SIDE, maximum=LARGEST_SIDE
+    )
     marker_size_overrides: tuple[str, ...] = param(
-        (), 'Sides of single markers, strings "ID:SIZE", e.g. ["7:0.50"].', unit='m', verify=size_overrides
+        (), 'Sides of single markers, strings "ID:SIZE", e.g. ["7:0.50"].', unit='m', verify=_refuse_two_sides
     )
 
 

@@ -309,7 +309,13 @@ def test_size_overrides():
     assert size_overrides(('7:0.5', '12:0.125')) == {7: 0.5, 12: 0.125}
 
 
-@pytest.mark.parametrize('entry', ['7', '7:', ':0.5', 'a:0.5', '7:b', '7:0', '7:-1', '7:nan', '7:inf'])
+@pytest.mark.parametrize('entry', ['7', '7:', ':0.5', 'a:0.5', '7:b', '7:0', '7:-1', '7:nan', '7:inf', '7:50'])
 def test_a_broken_override_is_refused(entry):
     with pytest.raises(InputError, match='marker_size_overrides'):
         size_overrides((entry,))
+
+
+def test_two_sides_of_one_marker_are_refused():
+    """The last one counted, without a word, and poses were off by the ratio of the two."""
+    with pytest.raises(InputError, match=r'^parameter marker_size_overrides: marker 7 is there twice$'):
+        ArucoDetectorConfig(marker_size_overrides=('7:0.5', '12:0.125', '07:0.4'))

@@ -6,8 +6,6 @@ from thermal_fiducial.core.types import FloatArray
 
 #: Farthest coordinate of anything in a map [m]; single precision still resolves a centimetre there.
 LARGEST_COORDINATE = 1e5
-#: Largest side of a marker [m].
-LARGEST_MARKER_M = 100.0
 #: Tolerance of a covariance's symmetry and eigenvalues, relative to its largest element: rounding to so many.
 _SIX_DIGITS = 1e-6
 

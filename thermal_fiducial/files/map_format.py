@@ -14,7 +14,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from thermal_fiducial.core.map_limits import fault_of_covariance, LARGEST_COORDINATE, LARGEST_MARKER_M
+from thermal_fiducial.config import LARGEST_SIDE
+from thermal_fiducial.core.map_limits import fault_of_covariance, LARGEST_COORDINATE
 from thermal_fiducial.core.types import LARGEST_ID
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.schema import load_yaml, parse_yaml, Value
@@ -179,7 +180,7 @@ def _count(value: Value) -> int:
 
 def _size(value: Value) -> float:
     size = value.number()
-    if not 0.0 < size < LARGEST_MARKER_M:
+    if not 0.0 < size <= LARGEST_SIDE:
         raise value.error(f'{value.quoted()} is not a side in metres')
     return size
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from thermal_fiducial.config import ImuNoise, parameters
+from thermal_fiducial.config import ImuNoise, LARGEST_SIDE, parameters
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import is_rigid, require_usable
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
-from thermal_fiducial.core.map_limits import LARGEST_COORDINATE, LARGEST_MARKER_M
+from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import MODEL_SYNONYMS
@@ -68,7 +68,7 @@ def of_rig(path: Path, camera: str) -> Rig:
         orientation = _needed(entry, 'camera_orientation').unit_quaternion()
         position = _needed(entry, 'camera_position').numbers(3, LARGEST_COORDINATE)
         T_body_camera = transform_from_quaternion(position, orientation)
-    size = top['marker_size'].number(0.0, LARGEST_MARKER_M) if 'marker_size' in top else 0.0
+    size = top['marker_size'].number(0.0, LARGEST_SIDE) if 'marker_size' in top else 0.0
     dictionary = top['dictionary'].text() if 'dictionary' in top else ''
     return Rig(lens, T_body_camera, _noise(top.get('imu')), _offset(fields, 'time_offset'), size, dictionary)
 

@@ -107,6 +107,7 @@ def test_what_is_left_out_has_defaults(tmp_path):
         (HEAD + ENTRY + ENTRY, 'markers\\[1\\].*marker 2 is there twice'),
         (HEAD + ENTRY.replace('id: 2', 'id: two'), "markers\\[0\\]: id: 'two'"),
         (HEAD + ENTRY.replace('size: 0.3', 'size: -1'), 'marker 2.*size'),
+        (HEAD + ENTRY.replace('size: 0.3', 'size: 30'), "marker 2.*size: '30' is not a side in metres"),
         (HEAD + ENTRY.replace('size: 0.3, ', ''), 'no size'),
         (HEAD + ENTRY.replace('fixed: true', 'fixed: maybe'), 'fixed'),
         (HEAD + ENTRY.replace('[1, 2, 3]', '[1, 2]'), 'position: not a list of 3 numbers'),

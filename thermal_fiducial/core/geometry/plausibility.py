@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermal_fiducial.core.map_limits import LARGEST_COORDINATE, LARGEST_MARKER_M
+from thermal_fiducial.config import LARGEST_SIDE
+from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 from thermal_fiducial.core.types import Counts, FloatArray, Gray
 from thermal_fiducial.errors import InputError
 
@@ -97,7 +98,7 @@ def require_numbers(values: FloatArray, shape: tuple[int, ...], what: str) -> No
 
 def require_side(size: object, what: str) -> None:
     """Raise InputError if ``size`` is no side of a marker [m]."""
-    if not (isinstance(size, (int, float, np.floating)) and 0.0 < size < LARGEST_MARKER_M):
+    if not (isinstance(size, (int, float, np.floating)) and 0.0 < size <= LARGEST_SIDE):
         raise InputError(f'{what}: {size!r} is not a side in metres')
 
 
