@@ -7,6 +7,7 @@ The nodes declare them as ROS parameters, the offline pipeline uses the same con
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, Field, field, fields, MISSING
 import difflib
+from itertools import combinations
 import math
 import os
 import re
@@ -19,6 +20,8 @@ Config = TypeVar('Config')
 _NORM_TOLERANCE = 0.01
 #: Longest quotation of a value in an error message [characters].
 _LONGEST_SHOWN = 100
+#: Parameters with frames: that of the map, those of the robot.
+_FRAMES = ('map_frame', 'odom_frame', 'base_frame', 'camera_frame')
 #: Parameters that rclpy declares on every node.
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
 #: Prefix of ROS's parameters for the quality of service, which a file for several packages may have.
@@ -90,13 +93,14 @@ class SelfChecked:
     Raises
     ------
     InputError
-        A value of the wrong type, out of range, or not among the choices.
+        A value of the wrong type, out of range, or not among the choices; two frames of one name.
     """
 
     def __post_init__(self) -> None:
         for item in fields(self):
             if item.default_factory is MISSING:
                 object.__setattr__(self, item.name, checked(item.name, item, getattr(self, item.name)))
+        _refuse_equal_frames(self)
 
 
 def group(kind: type) -> Any:
@@ -190,6 +194,14 @@ def from_home(path: str) -> str:
 def frame_name(name: str) -> str:
     """``name`` without the slash that names of frames begin with in ROS 1; tf2 refuses it in messages."""
     return name.lstrip('/')
+
+
+def _refuse_equal_frames(config: object) -> None:
+    """Raise InputError if two of the frames have one name: a tree of TF has each but once."""
+    names = {name: getattr(config, name, '') for name in _FRAMES}
+    for name, other in combinations(filter(names.get, names), 2):
+        if names[name] == names[other]:
+            raise InputError(f'parameters {name} and {other}: both are {_shown(names[name])}, and must be two frames')
 
 
 def _shown(value: object) -> str:

@@ -304,6 +304,21 @@ def test_a_name_that_no_node_has_is_refused_with_the_closest_one():
     check_names(['gate', 'use_sim_time', 'qos_overrides./tf.publisher.depth'])
 
 
+@pytest.mark.parametrize(
+    ('changes', 'two'),
+    [
+        ({'camera_frame': 'base_link'}, 'base_frame and camera_frame'),
+        ({'map_frame': '/base_link'}, 'map_frame and base_frame'),
+        ({'odom_frame': 'map', 'publish_tf': True, 'smoothing_time': 1.0}, 'map_frame and odom_frame'),
+    ],
+)
+def test_two_frames_of_one_name_are_refused(changes, two):
+    """With the camera's that of the robot, any message on /tf_static put it into the IMU; others make loops of TF."""
+    with pytest.raises(InputError, match=f'^parameters {two}: both are .*, and must be two frames$'):
+        PoseEkfConfig(**changes)
+    assert PoseEkfConfig(odom_frame='').odom_frame == ''
+
+
 def test_size_overrides():
     assert size_overrides(()) == {}
     assert size_overrides(('7:0.5', '12:0.125')) == {7: 0.5, 12: 0.125}
