@@ -1,6 +1,7 @@
 """Ranges of numbers on the command line. None holds NaN, infinity, or what no plate, board, camera or room has."""
 
 from thermal_fiducial.cli.subcommands import number, whole_number
+from thermal_fiducial.config import LARGEST_SIDE, SMALLEST_SIDE
 from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 
 #: Length of a sheet or between cuts: the widest sheets of acrylic are 2 to 3 m.
@@ -17,8 +18,8 @@ BOARD_POINTS, MORE_POINTS = whole_number(1, 100), whole_number(0, 100)
 IMAGE_PX, FOCAL_PX = whole_number(32, 65_535), number(10.0, 100_000.0, 'px')
 #: Focal length, of which a smaller number is probably in metres.
 LENS_MM = number(0.5, 1_000.0, 'mm')
-#: Side of a marker: from a grain of dust, which is no marker, to a house.
-SIDE_M = number(1e-3, 100.0, 'm')
+#: Side of a marker, as in the parameters and in maps: a larger number is probably in centimetres.
+SIDE_M = number(SMALLEST_SIDE, LARGEST_SIDE, 'm')
 #: Thickness of plates, of which a larger number is probably in millimetres.
 PLATE_M = number(0.0, 0.05, 'm')
 #: Marker IDs, above those of any dictionary.

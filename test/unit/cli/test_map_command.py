@@ -201,6 +201,13 @@ def test_align_does_not_replace_its_inputs(path, capsys, name):
     assert (path.read_bytes(), cloud.read_bytes()) == before
 
 
+def test_a_side_in_centimetres_is_refused(path, capsys):
+    """It made a map a hundred times too large, which a mapper would take."""
+    with pytest.raises(SystemExit, match='2'):
+        run('--marker-size', 30, 'show', path)
+    assert "'30' is not a number from 0.005 to 10 m" in capsys.readouterr().err
+
+
 def test_anchor_names_surveyed_markers_that_the_map_lacks(path, poses, capsys):
     """A wrong ID in the survey was passed over in silence."""
     survey = path.parent / 'survey.csv'
