@@ -66,6 +66,8 @@ class ImuNoiseMonitor:
         self._mean_force: list[float] = []
         # Of gyroscope and accelerometer, as single numbers: small arrays take ten times as long.
         self._sheet = noise.gyroscope_noise_density, noise.accelerometer_noise_density
+        #: densities of the white noise alone, as of the newest sample [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]
+        self.white = self._sheet
         self._nonlinearity = noise.gyroscope_nonlinearity, noise.accelerometer_nonlinearity
         self._ranges = noise.gyroscope_range, noise.accelerometer_range
         self._saturated = [0.0, 0.0]
@@ -74,12 +76,6 @@ class ImuNoiseMonitor:
     def vibration(self) -> tuple[float, float]:
         """Densities of the floor of the vibration's spectrum [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]."""
         return self._floor.densities
-
-    @property
-    def white(self) -> tuple[float, float]:
-        """Densities of the white noise alone [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]."""
-        rate, force = self._floor.densities
-        return max(self._sheet[0], self._noise.vibration * rate), max(self._sheet[1], self._noise.vibration * force)
 
     def densities(self, imu: FloatArray, seconds: float) -> FloatArray:
         """(6,) densities for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
@@ -91,12 +87,15 @@ class ImuNoiseMonitor:
         values = imu.tolist()
         rates, forces = values[:3], values[3:]
         motions = math.hypot(*rates), self._motion_of(forces, seconds)
-        white, squares = self.white, []
+        (rate_sheet, force_sheet), (rate_floor, force_floor) = self._sheet, self._floor.densities
+        factor = self._noise.vibration
+        self.white = max(rate_sheet, factor * rate_floor), max(force_sheet, factor * force_floor)
+        squares = []
         for triad, (readings, motion) in enumerate(zip((rates, forces), motions, strict=True)):
             moving = (self._nonlinearity[triad] * motion) ** 2 * _MOTION_TIME
             beyond = max(map(abs, readings)) >= self._ranges[triad]
             lost = _SATURATED[triad] ** 2 * seconds if beyond else 0.0
-            squares.append(white[triad] ** 2 + moving + between[triad] + max(lost, self._saturated[triad]))
+            squares.append(self.white[triad] ** 2 + moving + between[triad] + max(lost, self._saturated[triad]))
             self._saturated[triad] = lost
         rate, force = map(math.sqrt, squares)
         return np.array((rate, rate, rate, force, force, force))

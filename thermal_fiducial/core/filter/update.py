@@ -157,8 +157,7 @@ def with_covariance(config: PoseEkfConfig, innovation: Innovation, covariance: F
 def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
     """The estimate after an accepted pose."""
     prior, before = innovation.prior, innovation.derivative
-    clock = _clock_evidence(innovation)
-    gain, covariance = _gained(innovation, clock.share_of_motion)
+    gain, covariance, clock = _gained(innovation)
     error = _iterated(innovation, gain)
     state = prior.state.plus(error)
     if config.estimate_time_offset:
@@ -276,50 +275,43 @@ def _in_clock_of_imu(P: FloatArray, followed: FloatArray) -> FloatArray:
     return P
 
 
-def _clock_evidence(innovation: Innovation) -> ClockEvidence:
-    """What this and the latest poses say of the clock offset.
+def _clock_evidence(innovation: Innovation, by_pose: float) -> ClockEvidence:
+    """What this and the latest poses say of the clock offset, whose variance falls by ``by_pose`` [s^2] with this one.
 
     The derivative of a pose by the offset is a measured motion. Its white noise, of covariance N, adds spurious
     information (errors in variables): at once tr(S^-1 N), and by what the state has taken up of the noise at earlier
     poses. With the gain G = 1 - R S^-1 of a pose on itself that is G / (2 - G) times as much, in all
     2 tr((S + R)^-1 N).
     """
-    S = innovation.S_exact
-    seen = _exact_covariance(innovation)[TIME_OFFSET] @ innovation.H.T
     variance = float(innovation.prior.covariance[TIME_OFFSET, TIME_OFFSET])
-    information = float(seen @ np.linalg.solve(S, seen)) / max(variance, TINY) ** 2
-    spurious = 2.0 * float(np.linalg.inv(S + innovation.R).diagonal() @ innovation.motion.white)
+    information = by_pose / max(variance, TINY) ** 2
+    spurious = 2.0 * float(np.linalg.inv(innovation.S_exact + innovation.R).diagonal() @ innovation.motion.white)
     return innovation.prior.clock.after(information, spurious)
 
 
-def _exact_covariance(innovation: Innovation) -> FloatArray:
-    """Covariance (54, 54) of the prior if the extrinsics were exact."""
-    of_extrinsics = innovation.of_extrinsics
-    exact = innovation.prior.covariance - of_extrinsics @ of_extrinsics.T
-    # Where rounding leaves variances below zero, they would grow with each update.
-    exact[EXTRINSICS], exact[:, EXTRINSICS] = 0.0, 0.0
-    return np.asarray(exact)
-
-
-def _gained(innovation: Innovation, share_of_motion: float) -> tuple[FloatArray, FloatArray]:
-    """Kalman update: the gain (54, 6) and the covariance (54, 54).
+def _gained(innovation: Innovation) -> tuple[FloatArray, FloatArray, ClockEvidence]:
+    """Kalman update: the gain (54, 6), the covariance (54, 54), and what is known of the clock offset.
 
     The gain is that of exact extrinsics, so the estimate does not depend on how well they are said to be known; the
     covariance has all that their errors do to it.
 
-    ``share_of_motion``: of the information about the clock offset, the rest is that of noise. The offset is corrected
-    by that share, the best linear estimate, and its variance falls by the square of it: the noise is in what the
-    correction adds, and not in what it takes away.
+    Of the information about the clock offset a part is that of noise. The offset is corrected by the share of the rest,
+    the best linear estimate, and its variance falls by the square of it: the noise is in what the correction adds, and
+    not in what it takes away.
     """
     algebra, of_extrinsics = copy(_ALGEBRA), innovation.of_extrinsics
-    algebra.x, algebra.P = np.zeros(SIZE), _exact_covariance(innovation)
+    exact = innovation.prior.covariance - of_extrinsics @ of_extrinsics.T
+    # Where rounding leaves variances below zero, they would grow with each update.
+    exact[EXTRINSICS], exact[:, EXTRINSICS] = 0.0, 0.0
+    algebra.x, algebra.P = np.zeros(SIZE), exact
     algebra.update(innovation.value, lambda _: innovation.H, lambda _: np.zeros(6), R=innovation.R)
     gain, covariance = algebra.K, 0.5 * (algebra.P + algebra.P.T)
-    by_pose = gain[TIME_OFFSET] @ innovation.S_exact @ gain[TIME_OFFSET]
-    covariance[TIME_OFFSET, TIME_OFFSET] += (1.0 - share_of_motion**2) * by_pose
-    gain[TIME_OFFSET] *= share_of_motion
+    by_pose = float(gain[TIME_OFFSET] @ innovation.S_exact @ gain[TIME_OFFSET])
+    clock = _clock_evidence(innovation, by_pose)
+    covariance[TIME_OFFSET, TIME_OFFSET] += (1.0 - clock.share_of_motion**2) * by_pose
+    gain[TIME_OFFSET] *= clock.share_of_motion
     of_extrinsics = of_extrinsics - gain @ (innovation.H @ of_extrinsics)
-    return gain, covariance + of_extrinsics @ of_extrinsics.T
+    return gain, covariance + of_extrinsics @ of_extrinsics.T, clock
 
 
 def _iterated(innovation: Innovation, gain: FloatArray) -> FloatArray:
