@@ -672,6 +672,14 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
         maximum=0.1,
         dynamic=True,
     )
+    readout_time_std: float = param(
+        0.015,
+        'Prior standard deviation of what readout_time is wrong by, which is estimated and enters the covariances of '
+        'poses. calibrate camera-imu writes a smaller one; 0: it is exactly as declared.',
+        unit='s',
+        minimum=0.0,
+        maximum=0.05,
+    )
     bridge_duration: float = param(
         3.0,
         'Time since the last mapped marker during which new markers may be placed by odometry alone.',

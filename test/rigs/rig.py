@@ -15,11 +15,12 @@ SECONDS = 15.0
 #: The camera's axes in a body whose camera looks ahead: z forward, x right, y down.
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 #: How large a rig's errors are, in parameters whose defaults claim more: 3 mrad, sides of 0.3 %, one error of 0.2 % for
-#: both focal lengths (rigs have one for each, whose mean counts), bias instability, a tilt of the map.
+#: both focal lengths (rigs have one for each, whose mean counts), a readout time, bias instability, a tilt of the map.
 AS_DRAWN = {
     'extrinsics_orientation_std': 0.002,
     'marker_size_std': 0.0,
     'focal_length_std': 0.0014,
+    'readout_time_std': 0.0,
     'map_tilt_std': 0.0,
     'initial_gyroscope_bias_std': 0.005,
     'initial_accelerometer_bias_std': 0.05,

@@ -19,6 +19,7 @@ from thermal_fiducial.cli.recorded_corners import has_corners_only, recorded_row
 from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite, warn
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.error_model import READOUT_AS_DECLARED
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MarkerMap
@@ -207,6 +208,7 @@ def _extrinsics_text(result: 'CameraImuCalibration') -> str:
             f'    extrinsics_orientation_std: {orientation_std:.6f}',
             f'    camera_time_offset: {result.time_offset:.6f}  # +- {1e3 * sigma[6]:.3f} ms',
             f'    readout_time: {result.readout_time:.6f}  # +- {1e3 * result.readout_sigma:.3f} ms',
+            f'    readout_time_std: {max(result.readout_sigma, READOUT_AS_DECLARED):.6f}',
             f'    stamp_jitter: {max(result.stamp_jitter, PoseEkfConfig().stamp_jitter):.6f}  # found: '
             f'{1e3 * result.stamp_jitter:.3f} ms',
             '',

@@ -39,6 +39,10 @@ class SystematicErrors:
     #: 0.3 % a marker seen from the front may look tilted by 4 degrees. Enters with the errors of the lens
     #: (``LensErrors``).
     aspect: float = 1.0
+    #: How much of a rolling shutter's readout time is not declared [s]: cores read their rows in 8 to 33 ms, or all at
+    #: once. Prior of its estimate, by frames and in an adjustment of the map, whose covariances have what that leaves;
+    #: enters poses by that (``UndeclaredReadout``).
+    readout_time_std: float = 0.015
     #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges. To
     #: begin with, and at most, as measured on rendered flights with three lenses and 0.5 to 9 K; learned in flight from
     #: residuals that last (``CornerBias``). Enters the covariance of a joint adjustment.
@@ -63,10 +67,9 @@ CHI2_OF_VIEW = 26.1
 #: Errors of successive poses last as long as the view, for seconds: this many count as one. Enters the clock of a
 #: second camera (``SecondClock``).
 CORRELATED_POSES = 30.0
-#: Readout time of a rolling shutter [s]: what a calibration leaves of it (0.1 to 0.3 ms where rows are read in 16 ms),
-#: and how much of it may not be declared (cores read their rows in 8 to 33 ms, or all at once). Enter the decision that
-#: it is not as declared, and the estimate (``UndeclaredReadout``).
-READOUT_AS_DECLARED, READOUT_STD = 5e-4, 0.015
+#: What a calibration leaves of the readout time of a rolling shutter [s]: 0.1 to 0.3 ms where rows are read in 16 ms.
+#: Enters the decision to name it as not declared.
+READOUT_AS_DECLARED = 5e-4
 #: Share of an undeclared readout time that corners do not show, as the detector fits squares to what it has sheared: up
 #: to a tenth on rendered frames. Enters the error of that time, and with it poses.
 HIDDEN_OF_READOUT = 0.1

@@ -276,6 +276,7 @@ def _parameters(scenario: Scenario) -> dict[str, Any]:
         # Nothing is measured or calibrated here: all is exactly as the parameters say.
         'marker_size_std': 0.0,
         'focal_length_std': 0.0,
+        'readout_time_std': 0.0,
         'extrinsics_position_std': 0.0,
         'extrinsics_orientation_std': 0.0,
         'camera_time_offset': float(scenario.camera_time_offset),

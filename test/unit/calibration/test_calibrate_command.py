@@ -75,6 +75,8 @@ def test_camera_against_imu(tmp_path, capsys):
     assert np.degrees(found['extrinsics_orientation_std']) == pytest.approx(
         max([*left_deg, np.degrees(0.002)]), abs=1e-4
     )
+    readout_ms = float(re.search(r'readout_time: \S+  # \+- (\S+) ms', printed.out)[1])
+    assert 1e3 * found['readout_time_std'] == pytest.approx(max(readout_ms, 0.5), abs=0.001)
     assert 'turns about all three axes' in printed.err
 
 

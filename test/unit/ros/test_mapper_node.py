@@ -17,6 +17,7 @@ from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.geometry.se3 import apply, inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MapperResult, MarkerMap
+from thermal_fiducial.core.mapping.undeclared_readout import ReadoutEstimate
 from thermal_fiducial.core.measurements import MARKER_DTYPE
 from thermal_fiducial.files.map_history import entries
 from thermal_fiducial.files.marker_map import save_map
@@ -131,7 +132,7 @@ def test_a_map_in_other_units_is_doubted_though_frames_allow_two_poses_or_none(g
 def test_a_rolling_shutter_that_is_not_as_declared_is_named(graph, map_file):
     node = graph.add(MarkerMapperNode, map_file=str(map_file))
     assert node.headline() == ''
-    node.mapper.readout.seconds, node.mapper.readout.std = 0.0147, 0.0015
+    node.mapper.readout.adopt(ReadoutEstimate(0.0147, 0.0003))
     said = 'rows are read over 14.7 +- 1.5 ms more than readout_time says: add 0.0147'
     level, reason = node.state()
     assert (level, node.headline(), said in reason) == (WARN, said, True)

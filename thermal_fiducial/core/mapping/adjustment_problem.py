@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from thermal_fiducial.config import CHI2_OF_POSE
-from thermal_fiducial.core.error_model import CHI2_OF_VIEW, READOUT_STD, SystematicErrors
+from thermal_fiducial.core.error_model import CHI2_OF_VIEW, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, marker_corners, retract, whitening
 from thermal_fiducial.core.geometry.rigid_fit import BEHIND_CHI2, Images, linearised, robust
@@ -71,7 +71,7 @@ class Snapshot:
     map_revision: int
     #: systematic errors that enter the covariances
     errors: SystematicErrors
-    #: what the readout time is known to be declared too short by [s]
+    #: what the readout time is declared too short by, as estimated before [s]
     readout: float = 0.0
 
     def useful(self) -> BoolArray:
@@ -110,8 +110,7 @@ class Snapshot:
 class Poses:
     """Poses of all keyframes (F, 4, 4) and markers (M, 4, 4), and of the frame of the odometry (4, 4).
 
-    And the error of the aspect ratio, and that of the readout time where it is estimated (L,), in units of their
-    standard deviations.
+    And the errors of aspect ratio and readout time (2,), in units of their standard deviations.
     """
 
     T_map_camera: FloatArray
@@ -180,13 +179,11 @@ class MapProblem:
     corners: FloatArray
     W: FloatArray
     images: Images
-    #: (n, 8, L) whitened corners by one standard deviation of the aspect ratio, and of the readout time
+    #: (n, 8, 2) whitened corners by one standard deviation of the aspect ratio, and of the readout time
     J_common: FloatArray
-    #: (n, 8, 1) the latter
-    J_readout: FloatArray
     odometry: Priors
     known: Priors
-    #: (L,) of the priors of these
+    #: (2,) of the priors of these
     common_information: FloatArray
 
     @classmethod
@@ -202,10 +199,11 @@ class MapProblem:
         T_map_marker = np.stack([m.T_map_marker for m in markers])
         camera = snapshot.camera
         corners, W = snapshot.corners[views], whitening(snapshot.covariances[views])
-        corners = corners - snapshot.readout * snapshot.rates[views]
-        J_common = (W @ of_aspect(corners, camera, snapshot.errors)[..., None]).reshape(-1, 8, 1)
+        readout_std = snapshot.errors.readout_time_std
+        by_common = of_aspect(corners, camera, snapshot.errors), readout_std * snapshot.rates[views]
+        common = np.array([0.0, snapshot.readout / readout_std if readout_std else 0.0])
         return cls(
-            start=Poses(snapshot.T_map_camera[frames], T_map_marker, np.zeros(J_common.shape[-1])),
+            start=Poses(snapshot.T_map_camera[frames], T_map_marker, common),
             ids=marker_ids.tolist(),
             stamps=snapshot.stamps_ns[frames].tolist(),
             sizes=np.array([m.size for m in markers]),
@@ -217,17 +215,11 @@ class MapProblem:
             corners=corners,
             W=W,
             images=Images.of(ImagePoints.at(corners, camera), W),
-            J_common=J_common,
-            J_readout=READOUT_STD * (W @ snapshot.rates[views][..., None]).reshape(-1, 8, 1),
+            J_common=(W @ np.stack(by_common, axis=-1)).reshape(-1, 8, 2),
             odometry=Priors(snapshot.odometry.T[frames], snapshot.odometry.information[frames]),
             known=_known(snapshot, marker_ids, T_map_marker),
-            common_information=np.ones(1),
+            common_information=np.ones(2),
         )
-
-    def with_readout(self) -> 'MapProblem':
-        """With the error of the readout time among the unknowns."""
-        J_common = np.concatenate([self.J_common, self.J_readout], axis=-1)
-        return replace(self, J_common=J_common, common_information=np.append(self.common_information, 1.0))
 
     def evaluate(self, state: Poses) -> Linearised:
         """Whitened residuals and derivatives."""
@@ -275,7 +267,6 @@ class MapProblem:
             W=self.W[views],
             images=Images(self.images.whitening[views], self.images.target[views]),
             J_common=self.J_common[views],
-            J_readout=self.J_readout[views],
         )
 
     def spread(self, most: int) -> BoolArray:

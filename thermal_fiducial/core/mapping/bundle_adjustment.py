@@ -10,11 +10,10 @@ A pure function on a snapshot: it may run in another thread or process while the
 """
 
 from dataclasses import dataclass, replace
-import math
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import noise_factor, READOUT_STD
+from thermal_fiducial.core.error_model import noise_factor
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import retract
 from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
@@ -22,7 +21,7 @@ from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProb
 from thermal_fiducial.core.mapping.candidates import MAX_VIEWS, UNAMBIGUOUS
 from thermal_fiducial.core.mapping.error_sources import ErrorSources
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.mapping.undeclared_readout import CONTRADICTS, FoundReadout
+from thermal_fiducial.core.mapping.undeclared_readout import ReadoutEstimate
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
 MAX_ITERATIONS = 25
@@ -66,8 +65,8 @@ class AdjustedMap:
     inconsistent: dict[int, float]
     map_revision: int
     aspect: FoundAspect
-    #: what the readout time is declared too short by; None while nothing is contradicted
-    readout: FoundReadout | None = None
+    #: what the readout time is declared too short by; its prior where nothing shows it
+    readout: ReadoutEstimate
 
 
 def refine(snapshot: Snapshot) -> AdjustedMap | None:
@@ -76,30 +75,12 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
     if problem is None:
         return None
     now = problem.evaluate(problem.start)
-    if problem.J_common.any():
+    if problem.J_common[..., 0].any():
         problem = _weighed(problem, snapshot, now)
     now = _minimise(problem, now)
     mirrored = _with_mirrored(problem, now)
     now = now if mirrored is None else _minimise(problem, mirrored)
-    if snapshot.readout or problem.J_readout.any():
-        with_readout = problem.with_readout()
-        begin = with_readout.evaluate(replace(now.state, common=np.append(now.state.common, 0.0)))
-        if snapshot.readout or _contradicts_readout(with_readout, snapshot, begin):
-            problem, now = with_readout, _minimise(with_readout, begin)
     return _result(problem, snapshot, now)
-
-
-def _contradicts_readout(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> bool:
-    """Whether the views show another readout time than the declared one, by a step from the solution by that."""
-    widened, sources = _sources(problem, now)
-    if sources is None:
-        return False
-    step = sources.system.solve(sources.problem.normal(now, _scale(now.chi2))[1]).common[-1, 0]
-    by_noise = FoundReadout(READOUT_STD * step, READOUT_STD * math.sqrt(widened * sources.noise_of_common[-1, -1]))
-    if by_noise.sigmas < CONTRADICTS:
-        return False
-    std = math.sqrt(sources.variance_of_common(-1, widened, snapshot.errors))
-    return FoundReadout(READOUT_STD * step, READOUT_STD * std).sigmas > CONTRADICTS
 
 
 def _sources(problem: MapProblem, now: Linearised) -> tuple[float, ErrorSources | None]:
@@ -110,7 +91,12 @@ def _sources(problem: MapProblem, now: Linearised) -> tuple[float, ErrorSources 
     unknowns = 6 * (len(problem.stamps) + np.count_nonzero(~problem.held))
     widened = noise_factor(float(np.sum(now.chi2[full])), int(8 * np.count_nonzero(full) - unknowns))
     # What corners are off beyond their claim says nothing of priors: these keep theirs.
-    problem = replace(problem, odometry=problem.odometry.divided(widened), known=problem.known.divided(widened))
+    problem = replace(
+        problem,
+        odometry=problem.odometry.divided(widened),
+        known=problem.known.divided(widened),
+        common_information=problem.common_information * (1.0, widened),
+    )
     system = problem.equations.reduced(problem.normal(now, scale)[0])
     if system is None:
         return widened, None
@@ -129,8 +115,10 @@ def _weighed(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> MapPro
     prior = float(problem.common_information[0])
     shown = 1.0 / sources.system.covariance[0, 0] - prior
     gain = shown / (shown + prior)
-    best = min(gain**2 / max(sources.variance_of_common(0, widened, snapshot.errors), TINY), 1.0 - TINY)
-    return replace(problem, common_information=np.array([shown * (1.0 / best - 1.0)])) if best > TINY else problem
+    best = min(gain**2 / max(sources.variance_of_aspect(widened, snapshot.errors), TINY), 1.0 - TINY)
+    if best <= TINY:
+        return problem
+    return replace(problem, common_information=np.append(shown * (1.0 / best - 1.0), problem.common_information[1:]))
 
 
 def _minimise(problem: MapProblem, now: Linearised) -> Linearised:
@@ -216,7 +204,8 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
         return None
     full = sources.weights == 1.0
     known = np.stack([snapshot.markers[key].draws for key in problem.ids])
-    covariances, draws, left, common = sources.of_markers(widened, snapshot.errors, known)
+    unit = snapshot.errors.readout_time_std
+    covariances, draws, aspect_left, readout_std = sources.of_markers(widened, snapshot.errors, known)
     if not np.all(np.isfinite(covariances)):
         return None
     markers, inconsistent = {}, {}
@@ -238,17 +227,9 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
         now.cost(_scale(now.chi2)) / widened,
         inconsistent,
         snapshot.map_revision,
-        FoundAspect(problem.camera, float(now.state.common[0]), left),
-        _readout(now.state, common, snapshot.readout),
+        FoundAspect(problem.camera, float(now.state.common[0]), aspect_left),
+        ReadoutEstimate(unit * float(now.state.common[1]), unit * readout_std),
     )
-
-
-def _readout(state: Poses, common: FloatArray, known: float) -> FoundReadout | None:
-    """What was found of the readout time, beside what was ``known`` [s] of it."""
-    if len(state.common) < 2:
-        return None
-    std = READOUT_STD * math.sqrt(float(np.mean(common[-1] ** 2)))
-    return FoundReadout(known + READOUT_STD * float(state.common[-1]), std)
 
 
 def two_places(residuals: FloatArray, J: FloatArray, outlying: BoolArray) -> bool:

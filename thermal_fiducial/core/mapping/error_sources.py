@@ -33,8 +33,8 @@ class MapErrors(NamedTuple):
     draws: FloatArray
     #: (K,) draws of what is left of the aspect ratio's error, as a share of the declared one
     aspect_left: FloatArray
-    #: (L, K) draws of the errors of what was estimated that all views have in common
-    common: FloatArray
+    #: standard deviation of the readout time's estimate, in units of its prior
+    readout_std: float
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class ErrorSources:
     rng: np.random.Generator
 
     def of_markers(self, widened: float, errors: SystematicErrors, known: FloatArray) -> MapErrors:
-        """Errors of the markers, and what is left of the aspect ratio's.
+        """Errors of the markers, and what is left of those of aspect ratio and readout time.
 
         Parameters
         ----------
@@ -67,27 +67,25 @@ class ErrorSources:
         draws = by_corners.nodes + by_noise + by_held.nodes
         found = by_corners.common + np.sqrt(widened) * common + by_held.common
         aspect = LensErrors(problem.corners[:1], problem.camera, errors).aspect_draws
-        return MapErrors(covariances, draws[:-1], aspect - found[0], found)
+        return MapErrors(covariances, draws[:-1], aspect - found[0], float(np.sqrt(np.mean(found[1] ** 2))))
 
-    def variance_of_common(self, index: int, widened: float, errors: SystematicErrors) -> float:
-        """Of what is estimated of one of the L errors that all views have in common, by noise and all other errors.
-
-        The error of the aspect ratio is among these.
-        """
+    def variance_of_aspect(self, widened: float, errors: SystematicErrors) -> float:
+        """Of what is estimated of the aspect ratio's error, by noise and all other errors, itself among these."""
         problem, now, moved, covariance = self.problem, self.now, self.system.moved, self.system.covariance
         of_cameras = np.swapaxes(now.to_camera, -1, -2) @ moved.frames[problem.frame]
         by_common = problem.J_common - now.J @ (moved.nodes[problem.marker] + of_cameras)
-        gains = self._by_corners(by_common @ (covariance[:, index, None] / covariance[index, index]))
+        gains = self._by_corners(by_common @ (covariance[:, :1] / covariance[0, 0]))
         of_shapes = np.sum(problem.over_markers(gains) ** 2, axis=(1, 2, 3)) @ self._shapes(errors) ** 2
         of_lens = LensErrors(problem.corners, problem.camera, errors).covariance(gains.reshape(-1, 1, 2)).item()
-        noise = widened * self.noise_of_common[index, index]
-        return float(covariance[index, index] ** 2 * (of_shapes + of_lens) + noise)
+        noise = widened * self.noise_of_common[0, 0]
+        return float(covariance[0, 0] ** 2 * (of_shapes + of_lens) + noise)
 
     @property
     def noise_of_common(self) -> FloatArray:
-        """Covariance (L, L) by noise alone: the error of the aspect ratio is among the lasting ones."""
+        """Covariance (2, 2) by noise and the prior of the readout time; the aspect ratio's error is a lasting one."""
         covariance = self.system.covariance
-        return np.asarray(covariance - self.problem.common_information * covariance @ covariance)
+        by_aspect = covariance[:, :1]
+        return np.asarray(covariance - self.problem.common_information[0] * by_aspect @ by_aspect.T)
 
     def _lasting(self, errors: SystematicErrors) -> Vectors:
         """Right sides by corner errors that are the same in all views of a marker, and by those of the lens.

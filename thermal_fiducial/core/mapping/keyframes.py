@@ -211,7 +211,7 @@ class KeyframeStore:
     def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int, readout: float) -> Snapshot | None:
         """Input of an adjustment, with about ``views`` views of markers at most; None without keyframes.
 
-        ``readout`` : what the readout time is known to be declared too short by [s]
+        ``readout`` : what the readout time is declared too short by, as estimated before [s]
         """
         if not self.frames or self._camera is None:
             return None

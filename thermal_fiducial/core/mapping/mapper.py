@@ -86,8 +86,8 @@ class MarkerMapper:
 
     def _begin(self, marker_map: MarkerMap) -> None:
         self._bias = CornerBias()
-        #: a rolling shutter that is not as declared
-        self.readout = UndeclaredReadout()
+        #: what a rolling shutter is declared too short by
+        self.readout = UndeclaredReadout(self.config.readout_time_std)
         self._found: FoundAspect | None = None
         self._initial, self.map = marker_map.copy(), marker_map.with_assumed_draws(self.errors)
         self._new = NewMarkers(self.config.marker_size, size_overrides(self.config.marker_size_overrides))
@@ -159,6 +159,7 @@ class MarkerMapper:
             self._bias.px,
             marker_size_std=config.marker_size_std,
             focal_length_std=config.focal_length_std,
+            readout_time_std=config.readout_time_std,
             marker_shape=self._bias.shape,
             likely_corner_px=self._bias.likely_px,
         )
@@ -185,7 +186,7 @@ class MarkerMapper:
                 self._last = frame.pose or self._last
             updated = True
             # Step 7: errors updated.
-            self._bias.add(self.readout.explained(outcome, frame.camera, frame.predicted))
+            self._bias.add(outcome)
             ids, (errors, error_stds) = frame.known.observed.ids.tolist(), frame.known_errors(outcome)
             if self._owns_map:
                 used = outcome.pose.marker_ids
@@ -270,7 +271,7 @@ class MarkerMapper:
         ----------
         views : approximate largest number of views of markers, which bounds the time
         """
-        return self._keyframes.snapshot(self.map, self.errors, views, self.readout.seconds)
+        return self._keyframes.snapshot(self.map, self.errors, views, self.readout.estimate.seconds)
 
     def refine(self, views: int = sys.maxsize) -> AdjustedMap | None:
         """Run a bundle adjustment here, of so many ``views`` as :meth:`snapshot` takes, and apply it."""

@@ -1,9 +1,9 @@
-"""A rolling shutter whose rows are read over another time than ``readout_time`` says, found in flight by its frames.
+"""A rolling shutter whose rows are read over another time than ``readout_time`` says, estimated in flight.
 
 The detector moves corners to the stamp by the declared time. If that is too short by d, a corner at the share s of the
 rows, -1/2 in the first one and 1/2 in the last, stays displaced by d s times its velocity in the image. The pose of the
 frame takes up a part of that; what it leaves, in all frames, shows d by least squares. Where the map is made in the
-same flight, its adjustment has d among its unknowns, and knows better.
+same flight, its adjustment has d among its unknowns, and knows better. Poses always claim what is not known of it.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,6 @@ from thermal_fiducial.core.error_model import (
     HIDDEN_OF_READOUT,
     noise_factor,
     READOUT_AS_DECLARED,
-    READOUT_STD,
 )
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import INLIER
@@ -28,19 +27,22 @@ from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.types import FloatArray, TINY
 
-#: Standard deviations by which the time must be off before corners are corrected by it. In flights as declared it is up
-#: to 2.7.
-CONTRADICTS = 4.0
-# And before residuals count as of it, not of an error of the lens.
-_LIKELY = 1.0
+# Standard deviations by which the time must be off to be named. In flights as declared it is up to 2.7.
+_CONTRADICTS = 4.0
 
 
 @dataclass(frozen=True)
-class FoundReadout:
-    """What the readout time is declared too short by, and its standard deviation [s]."""
+class ReadoutEstimate:
+    """What the readout time is declared too short by, negative if too much is declared."""
 
+    #: the time and its standard deviation [s]
     seconds: float
     std: float
+
+    @property
+    def claim(self) -> float:
+        """The standard deviation with what a detector hides of the time [s]."""
+        return math.hypot(self.std, HIDDEN_OF_READOUT * self.seconds)
 
     @property
     def sigmas(self) -> float:
@@ -49,46 +51,40 @@ class FoundReadout:
 
 
 class UndeclaredReadout:
-    """What the readout time of a camera is declared too short by [s], as far as frames contradict the declaration."""
+    """What the readout time of a camera is declared too short by: its prior, and what frames and the map show of it."""
 
-    def __init__(self) -> None:
-        #: the time, negative if too much is declared, and its standard deviation; zero while nothing is contradicted
-        self.seconds, self.std = 0.0, 0.0
-        # The time while it is likely at least.
-        self._likely = 0.0
+    def __init__(self, prior_std: float) -> None:
+        """``prior_std`` : standard deviation of the prior [s]."""
+        self.estimate = ReadoutEstimate(0.0, prior_std)
+        self._prior_std = prior_std
         # Sums over frames: information, information times the time, and the variance of that by noise, and its joint
         # draws by errors of lens and map, which last as long as the flight.
         self._information, self._weighted, self._variance = 0.0, 0.0, 0.0
         self._common: FloatArray = np.zeros(DRAWS)
-        # What the last adjustment of the map has found.
-        self._by_map: FoundReadout | None = None
+        self._is_by_map = False
 
     def corrected(self, observed: Observations, camera: Camera, predicted: PredictedCamera | None) -> Observations:
         """The corners of N markers at the stamp, without what the time displaces them by in a camera in motion."""
-        if predicted is None or self.seconds == 0.0:
+        seconds = self.estimate.seconds
+        if predicted is None or seconds == 0.0:
             return observed
         rates, unsure = rates_of_rows(observed, camera, predicted)
-        corners = observed.corners - self.seconds * rates
-        return replace(observed, corners=corners, covariances=observed.covariances + self.seconds**2 * unsure)
+        return replace(
+            observed, corners=observed.corners - seconds * rates, covariances=observed.covariances + seconds**2 * unsure
+        )
 
     def claimed(self, location: Location, camera: Camera, predicted: PredictedCamera | None) -> Location:
         """The location, whose covariance has what is not known of the time."""
-        if predicted is None or self.std == 0.0:
+        if predicted is None or self.estimate.claim == 0.0:
             return location
-        moved = np.einsum('nij,nj->i', location.corner_gains, _rates(location, camera, predicted).reshape(-1, 2))
-        return replace(location, pose=location.pose.widened(covariance_of_one_error(moved, self.std)))
-
-    def explained(self, location: Location, camera: Camera, predicted: PredictedCamera | None) -> Location:
-        """The location with residuals of lens and detector alone: without those by the most likely time."""
-        fit, left = location.reprojection, self._likely - self.seconds
-        if predicted is None or left == 0.0:
-            return location
-        residuals = fit.residuals - left * _rates(location, camera, predicted)
-        return replace(location, reprojection=replace(fit, residuals=residuals))
+        shares = camera.readout_shares(location.sight.observed.corners[..., 1])
+        rates = shares.reshape(-1, 1) * (location.reprojection.J_camera @ predicted.velocity).reshape(-1, 2)
+        moved = np.einsum('nij,nj->i', location.corner_gains, rates)
+        return replace(location, pose=location.pose.widened(covariance_of_one_error(moved, self.estimate.claim)))
 
     def add(self, location: Location, camera: Camera, predicted: PredictedCamera | None) -> None:
         """Update with the residuals of a frame that was corrected by the time as known so far."""
-        if predicted is None or self._by_map is not None:
+        if predicted is None or self._is_by_map:
             return
         sight, fit = location.sight, location.reprojection
         W, shares = whitening(sight.observed.covariances), camera.readout_shares(sight.observed.corners[..., 1])
@@ -107,45 +103,37 @@ class UndeclaredReadout:
         by_map = by_corners.reshape(len(W), 1, 8) @ fit.J_marker
         common = location.lens.drawn_sum(by_corners)[0] - drawn_sum(by_map, sight.draws)[0]
         # A wrong velocity shows another time, by what it is unsure by.
-        noise = information * (noise_factor(chi2, len(rest) - 7) + READOUT_STD**2 * unsure)
+        noise = information * (noise_factor(chi2, len(rest) - 7) + self._prior_std**2 * unsure)
         weight = information / (noise + float(np.mean(common**2)) + TINY)
         self._information += weight * information
-        self._weighted += weight * (shown + information * self.seconds)
+        self._weighted += weight * (shown + information * self.estimate.seconds)
         self._variance += weight**2 * noise
         self._common += weight * common
-        self._judge()
+        self.estimate = self._by_frames()
 
-    def adopt(self, found: FoundReadout | None) -> None:
-        """Take over what an adjustment of the map has found, if anything; frames alone know less of it.
+    def adopt(self, by_map: ReadoutEstimate) -> None:
+        """Take over the estimate of an adjustment of the map; frames alone know less.
 
         They see the map as it is, and one that was made by displaced corners has taken up a part of the time.
         """
-        if found is not None:
-            self._by_map = found if found.sigmas > CONTRADICTS else None
-            self._judge()
+        self.estimate, self._is_by_map = by_map, True
 
-    def _judge(self) -> None:
-        """Take the time over where it is beyond doubt."""
-        found = self._by_map or self._by_frames()
-        self._likely = found.seconds if found.sigmas > _LIKELY else 0.0
-        self.seconds, self.std = 0.0, 0.0
-        if found.sigmas > CONTRADICTS:
-            self.seconds, self.std = found.seconds, math.hypot(found.std, HIDDEN_OF_READOUT * found.seconds)
-
-    def _by_frames(self) -> FoundReadout:
+    def _by_frames(self) -> ReadoutEstimate:
         """The time by the sums over frames and its prior."""
-        information = max(self._information, TINY)
-        variance = (self._variance + float(np.mean(self._common**2))) / information**2
-        share = READOUT_STD**2 / (READOUT_STD**2 + variance)
-        return FoundReadout(share * self._weighted / information, math.sqrt(share * variance))
+        variance = self._variance + float(np.mean(self._common**2))
+        by_prior = (self._information * self._prior_std) ** 2
+        share = by_prior / max(by_prior + variance, TINY)
+        seconds = share * self._weighted / max(self._information, TINY)
+        return ReadoutEstimate(seconds, self._prior_std * math.sqrt(1.0 - share))
 
     @property
     def doubt(self) -> str:
         """Warning for diagnostics and console, with what to write; empty while nothing contradicts the declaration."""
-        if self.seconds == 0.0:
+        seconds = self.estimate.seconds
+        if self.estimate.sigmas < _CONTRADICTS:
             return ''
-        off, std = 1e3 * abs(self.seconds), 1e3 * self.std
-        more, add = ('more', 'add') if self.seconds > 0.0 else ('less', 'subtract')
+        off, std = 1e3 * abs(seconds), 1e3 * self.estimate.claim
+        more, add = ('more', 'add') if seconds > 0.0 else ('less', 'subtract')
         return f'rows are read over {off:.1f} +- {std:.1f} ms {more} than readout_time says: {add} {1e-3 * off:.4f}'
 
 
@@ -162,10 +150,3 @@ def rates_of_rows(observed: Observations, camera: Camera, predicted: PredictedCa
 def _without(Q: FloatArray, errors: FloatArray) -> FloatArray:
     """``errors`` (n, ...) without their parts along the orthonormal directions ``Q`` (n, 6)."""
     return np.asarray(errors - Q @ (Q.T @ errors))
-
-
-def _rates(location: Location, camera: Camera, predicted: PredictedCamera) -> FloatArray:
-    """Displacement (N, 4, 2) of the corners of N located markers by each second of the time [px/s]."""
-    shares = camera.readout_shares(location.sight.observed.corners[..., 1])
-    moving = location.reprojection.J_camera @ predicted.velocity
-    return np.asarray(shares[..., None] * moving.reshape(*shares.shape, 2))

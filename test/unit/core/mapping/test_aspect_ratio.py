@@ -68,7 +68,7 @@ def test_the_variance_of_what_is_estimated_is_that_of_its_draws():
         estimated.append(lens.aspect_draws - errors.aspect_left)
     # The lens has the same draws each time, and these have just its covariance; 1920 draws of noise and shapes are
     # accurate to 3 %: three standard deviations.
-    assert np.isclose(np.mean(np.square(estimated)), sources.variance_of_common(0, 1.0, m.errors), rtol=0.1)
+    assert np.isclose(np.mean(np.square(estimated)), sources.variance_of_aspect(1.0, m.errors), rtol=0.1)
 
 
 @pytest.mark.parametrize('share', [0.0, 0.02])
