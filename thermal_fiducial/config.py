@@ -805,7 +805,7 @@ class PoseEkfConfig(ScheduleParameters, ClockParameters, FrameParameters, MountE
     imu: ImuNoise = group(ImuNoise)  # noqa: RUF009
     gravity: float = param(9.80665, 'Local gravity.', unit='m/s^2', minimum=9.7, maximum=9.9)
     map_tilt_std: float = param(
-        0.005,
+        0.010,
         'Prior standard deviation of the tilt of the map against gravity, which is estimated. 0: z is vertical.',
         unit='rad',
         minimum=0.0,
