@@ -12,7 +12,7 @@ from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
 from thermal_fiducial.cli.marker_sizes import add_sizes, join_sizes
 from thermal_fiducial.cli.parser import add_command, Commands, Parser
 from thermal_fiducial.cli.ranges import COORDINATE_M, MARKER_ID, QUATERNION, SIGMA_DEG, SIGMA_M
-from thermal_fiducial.cli.subcommands import file_to_write, require_unit
+from thermal_fiducial.cli.subcommands import file_to_write, require_unit, warn
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
@@ -30,6 +30,7 @@ from thermal_fiducial.files.marker_map import dump_map, load_map
 from thermal_fiducial.files.packages import require_plots
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.map_tools import map_editing
+from thermal_fiducial.map_tools.anchoring import anchor
 from thermal_fiducial.report.map_error import sigmas
 
 #: What the actions that add markers take for the side of one where nothing is said.
@@ -159,7 +160,7 @@ def _show(args: argparse.Namespace) -> int:
         sigma_mm, sigma_deg = sigmas(m)
         status = 'quarantine' if not m.trusted else 'fixed' if m.fixed else ''
         table.add_row(
-            str(key), f'{m.size:g}', f'{x:.4f}', f'{y:.4f}', f'{z:.4f}', _facing(m.T_map_marker[:3, 2]),
+            str(key), f'{m.size:g}', f'{x:.4f}', f'{y:.4f}', f'{z:.4f}', _direction(m.T_map_marker[:3, 2]),
             f'{sigma_mm:.2f}', f'{sigma_deg:.3f}', f'{m.reprojection_error_px:.3f}',
             str(m.observations), status,
         )  # fmt: skip
@@ -172,11 +173,11 @@ def _show(args: argparse.Namespace) -> int:
     return 0
 
 
-def _facing(normal: FloatArray) -> str:
-    """Direction of a marker's normal: the nearest axis, and the angle to it."""
-    axis = int(np.argmax(np.abs(normal)))
-    off = np.rad2deg(np.arccos(np.clip(abs(normal[axis]), -1.0, 1.0)))
-    return f'{"-" if normal[axis] < 0 else "+"}{"xyz"[axis]}' + (f' {off:.0f}°' if off >= 0.5 else '')
+def _direction(unit: FloatArray) -> str:
+    """Direction of a unit vector: the nearest axis of the map, and the angle to it."""
+    axis = int(np.argmax(np.abs(unit)))
+    off = np.rad2deg(np.arccos(np.clip(abs(unit[axis]), -1.0, 1.0)))
+    return f'{"-" if unit[axis] < 0 else "+"}{"xyz"[axis]}' + (f' {off:.0f}°' if off >= 0.5 else '')
 
 
 def _check(args: argparse.Namespace) -> int:
@@ -244,15 +245,19 @@ def _anchor(args: argparse.Namespace) -> int:
     surveyed = _survey(args.survey)
     marker_map = _load(args)
     with naming(args.survey):
-        _, distances = map_editing.anchor(marker_map, surveyed)
-    for key, distance in distances.items():
-        print(f'marker {key}: {1e3 * distance:.1f} mm from its surveyed place')
-    for key in sorted(surveyed.keys() - distances.keys()):
+        result = anchor(marker_map, surveyed)
+    for key, distance in result.distances_m.items():
+        axes = result.map.markers[key].T_map_marker[:3, :3]
+        sides = f'faces {_direction(axes[:, 2])}, its top points to {_direction(axes[:, 1])}'
+        print(f'marker {key}: {1e3 * distance:.1f} mm from its surveyed place; {sides}')
+    for key in sorted(surveyed.keys() - result.distances_m.keys()):
         print(f'marker {key}: surveyed, but not in the map')
+    for doubt in result.doubts:
+        warn(doubt)
 
     def anchored(marker_map: MarkerMap) -> MarkerMap:
-        moved, used = map_editing.anchor(marker_map, surveyed)
-        return map_editing.set_fixed(moved, used, True) if args.fix else moved
+        moved = anchor(marker_map, surveyed)
+        return map_editing.set_fixed(moved.map, moved.distances_m, True) if args.fix else moved.map
 
     return _edit(args, f'anchor to {args.survey.name}', anchored)
 

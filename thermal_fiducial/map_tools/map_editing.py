@@ -6,15 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, lever_arm, turned
-from thermal_fiducial.core.geometry.se3 import apply, rigid_alignment
 from thermal_fiducial.core.mapping.map_data import align, Alignment, MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.core.wording import listed, number_of
+from thermal_fiducial.core.wording import listed
 from thermal_fiducial.errors import InputError
-
-# Distance of a surveyed marker from its place, as a share of the surveyed part's radius, beyond which the survey
-# contradicts the map: maps by one marker are off by a per cent, an exchanged ID or another unit by much more.
-_CONTRADICTS = 0.1
 
 
 def set_fixed(marker_map: MarkerMap, ids: Iterable[int], fixed: bool) -> MarkerMap:
@@ -137,37 +132,6 @@ def _misfit(
     mean_square = float(np.mean(np.square([alignment.residuals_m[key] for key in common])))
     spread = float(np.mean(np.sum((corners - middle) ** 2, axis=-1)))
     return middle, np.diag([mean_square / 3.0] * 3 + [mean_square / spread] * 3)
-
-
-def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[MarkerMap, dict[int, float]]:
-    """Align the map to surveyed positions (3,) [m] of the centres of at least three markers.
-
-    Returns
-    -------
-    The map, and the distance of each surveyed centre after the alignment [m].
-
-    Raises
-    ------
-    InputError
-        Fewer than three surveyed markers in the map, or all collinear, or in places that contradict the map.
-    """
-    common = sorted(marker_map.markers.keys() & surveyed.keys())
-    if len(common) < 3:
-        raise InputError(f'{number_of(len(common), "surveyed marker")} in the map: three are needed')
-    target = np.stack([surveyed[key] for key in common])
-    source = np.stack([marker_map.markers[key].T_map_marker[:3, 3] for key in common])
-    extents = np.linalg.svd(target - target.mean(axis=0), compute_uv=False)
-    if extents[1] <= 0.02 * extents[0]:
-        raise InputError('the surveyed markers lie on a line, or in one place: they leave a rotation open')
-    T = rigid_alignment(target, source)
-    distances = np.linalg.norm(apply(T, source) - target, axis=-1)
-    worst = int(np.argmax(distances))
-    if distances[worst] > _CONTRADICTS * np.linalg.norm(source - source.mean(axis=0), axis=-1).max():
-        raise InputError(
-            f'the survey contradicts the map: marker {common[worst]} would be {distances[worst]:.3g} m from its place '
-            'there: are its numbers metres, its IDs right?'
-        )
-    return transformed(marker_map, T), dict(zip(common, distances.tolist(), strict=True))
 
 
 def marker_of(marker_map: MarkerMap, marker_id: int) -> MapMarker:

@@ -26,6 +26,9 @@ from thermal_fiducial.map_tools.map_building import build_map
 from thermal_fiducial.map_tools.map_doubts import doubts
 from thermal_fiducial.map_tools.map_editing import merge, transformed
 
+#: Left-handed axes of a survey, rows in those of the map.
+NORTH_EAST_UP, EAST_NORTH_DOWN = np.eye(3)[[1, 0, 2]], np.diag([1.0, 1.0, -1.0])
+
 
 @pytest.fixture
 def poses():
@@ -47,6 +50,11 @@ def path(tmp_path, poses):
 
 def run(*arguments):
     return main(['map', *(str(argument) for argument in arguments)])
+
+
+def write_survey(path, places):
+    """A file of the positions (3,) [m] by ID."""
+    path.write_text(''.join(f'{key},{x},{y},{z}\n' for key, (x, y, z) in places.items()))
 
 
 def test_show_lists_and_draws(path, capsys):
@@ -212,7 +220,7 @@ def test_anchor_names_surveyed_markers_that_the_map_lacks(path, poses, capsys):
     """A wrong ID in the survey was passed over in silence."""
     survey = path.parent / 'survey.csv'
     places = {key: poses[key][:3, 3] for key in (0, 3, 5)} | {99: np.zeros(3)}
-    survey.write_text(''.join(f'{key},{",".join(map(str, place))}\n' for key, place in places.items()))
+    write_survey(survey, places)
     assert run('anchor', path, survey) == 0
     assert 'marker 99: surveyed, but not in the map' in capsys.readouterr().out
 
@@ -243,10 +251,53 @@ def test_a_survey_that_contradicts_the_map_is_refused(path, poses, capsys, scale
     """The map was written, kilometres away, and with --fix its markers declared surveyed there."""
     survey, before = path.with_name('survey.csv'), path.read_bytes()
     places = [scale * poses[key][:3, 3] for key in (0, 3, 5, 6)]
-    survey.write_text(''.join(f'{key},{x},{y},{z}\n' for key, (x, y, z) in zip(ids, places, strict=True)))
+    write_survey(survey, dict(zip(ids, places, strict=True)))
     assert run('anchor', path, survey, '--fix') == 2
     assert 'survey.csv: the survey contradicts the map: marker ' in capsys.readouterr().err
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize('axes', [NORTH_EAST_UP, EAST_NORTH_DOWN])
+def test_a_left_handed_survey_is_refused(path, poses, capsys, axes):
+    """Its numbers were said to be no metres, or its IDs wrong."""
+    survey, before = path.with_name('survey.csv'), path.read_bytes()
+    write_survey(survey, {key: axes @ pose[:3, 3] for key, pose in poses.items()})
+    assert run('anchor', path, survey) == 2
+    assert 'survey.csv: the survey is a mirror image of the map' in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ('axes', 'sides', 'turned_deg'),
+    [
+        (np.eye(3), 'faces -x, its top points to +z', None),
+        (NORTH_EAST_UP, 'faces +y, its top points to +z', None),
+        (EAST_NORTH_DOWN, 'faces +x, its top points to -z', 180),
+    ],
+)
+def test_a_survey_in_a_plane_shows_its_axes_by_the_sides_of_the_markers(tmp_path, capsys, axes, sides, turned_deg):
+    """Left-handed axes fit at 0.0 mm: the map faced the other side, or stood on its head, without a word."""
+    path, survey = tmp_path / 'map.yaml', tmp_path / 'survey.csv'
+    poses = wall(np.random.default_rng(3), tilt=0.0)
+    for pose in poses.values():
+        pose[0, 3] = 3.0
+    save_map(path, MarkerMap({key: MapMarker(key, SIZE, True, pose) for key, pose in poses.items()}))
+    write_survey(survey, {key: axes @ pose[:3, 3] for key, pose in poses.items()})
+    assert run('anchor', path, survey) == 0
+    printed = capsys.readouterr()
+    assert f'marker 3: 0.0 mm from its surveyed place; {sides}' in printed.out
+    assert 'left-handed axes fit as well' in printed.err
+    assert (f'z of the map is turned by {turned_deg} deg' in printed.err) == (turned_deg is not None)
+
+
+def test_a_survey_with_z_downwards_is_warned_of(path, poses, capsys):
+    """North, east, down is right-handed and fits: the map stood on its head."""
+    survey = path.with_name('survey.csv')
+    write_survey(survey, {key: np.diag([1.0, -1.0, -1.0]) @ pose[:3, 3] for key, pose in poses.items()})
+    assert run('anchor', path, survey) == 0
+    error = capsys.readouterr().err
+    assert 'z of the map is turned by 180 deg' in error
+    assert 'left-handed' not in error
 
 
 @pytest.mark.parametrize(
