@@ -112,7 +112,7 @@ def _contradiction_of_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -
     if up @ force >= math.cos(LARGEST_TILT) * size and abs(size - gravity) <= HARDLY_GRAVITY * gravity:
         return None
     measured = ' '.join(f'{value:.1f}' for value in force)
-    details = f'the IMU says {measured} m/s^2; its axes, sign, units? camera_orientation?'
+    details = f'the IMU says {measured} m/s^2; its axes, sign, units? camera_orientation? z of the map?'
     return Condition('poses contradict gravity', details)
 
 
