@@ -16,6 +16,7 @@ from thermal_fiducial.core.error_model import covariance_of_one_error, INCONSIST
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
+from thermal_fiducial.core.mapping.contradicted_map import ContradictedMap, MOST, most_px
 from thermal_fiducial.core.mapping.localization import names
 from thermal_fiducial.core.mapping.located import (
     error_std_px,
@@ -35,7 +36,7 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
 #: Reason of quarantine of markers that the map file already had there.
 FROM_FILE = 'in quarantine since before the map was loaded'
 #: Share of inconsistent frames above which a marker is put in quarantine, and below which it is released.
-QUARANTINE, RELEASE = 0.7, 0.1
+QUARANTINE, RELEASE = MOST, 0.1
 #: Ratio of an error to its standard deviation above which a frame counts as inconsistent.
 DISAGREEMENT = 4.0
 #: Markers that must have agreed with odometry for it to count against another: two against one.
@@ -105,6 +106,8 @@ class Consistency:
         self.quarantined = {key: FROM_FILE for key, marker in markers.items() if not marker.trusted}
         # Shares of inconsistent frames by ID: markers that the file has in quarantine stay until frames release them.
         self._shares = dict.fromkeys(self.quarantined, 1.0)
+        #: whether most markers contradict the map
+        self.of_map = ContradictedMap()
         #: whether odometry has agreed with any marker since the map was loaded
         self.odometry_agreed = False
         #: IDs of markers that have agreed with odometry
@@ -114,7 +117,9 @@ class Consistency:
         self._contradicted_ns: int | None = None
 
     def checked(self, frame: LocatedFrame) -> LocatedFrame:
-        """The ``frame``, without its pose if that is from a misplaced marker."""
+        """The ``frame``, without its pose if that is from a misplaced marker, or from a map that most contradict."""
+        if self.of_map.doubt:
+            return replace(frame, contradicts_map=True)
         outcome = frame.outcome
         if isinstance(outcome, Refusal) or len(outcome.pose.marker_ids) > 1:
             return frame
@@ -156,6 +161,15 @@ class Consistency:
             self._witnesses |= ids
         if self._misplaced and self._misplaced.id in ids:
             self._misplaced = None
+
+    def weigh_map(self, frame: LocatedFrame) -> None:
+        """Note which markers of a frame agree with the map. A frame with two possible poses says nothing of it."""
+        known, outcome = frame.known, frame.outcome
+        if isinstance(outcome, Location):
+            errors, error_stds = frame.known_errors(outcome)
+            self.of_map.add(known, errors <= np.minimum(DISAGREEMENT * error_stds, most_px(known)))
+        elif outcome.compared and outcome.pose is None:
+            self.of_map.add(known, np.zeros(len(known.sizes), dtype=np.bool_))
 
     def judge(
         self,

@@ -211,16 +211,20 @@ class LocatedFrame:
     #: the camera pose by odometry
     predicted: PredictedCamera | None
     outcome: Location | Refusal
+    #: whether most markers contradict the map
+    contradicts_map: bool = False
 
     @property
     def pose(self) -> CameraPose | None:
-        """To publish; None without one, or if its attitude is too uncertain."""
-        vague = self.reason and isinstance(self.outcome, Location)
-        return None if vague else self.outcome.pose
+        """To publish; None without one, from a contradicted map, or if its attitude is too uncertain."""
+        withheld = self.contradicts_map or (self.reason and isinstance(self.outcome, Location))
+        return None if withheld else self.outcome.pose
 
     @cached_property
     def reason(self) -> str:
         """Why there is no pose to publish, or one of two, in words; else empty."""
+        if self.contradicts_map:
+            return 'most markers contradict the map'
         if isinstance(self.outcome, Refusal):
             return self.outcome.reason
         std = self.outcome.rotation_std

@@ -200,6 +200,8 @@ class MarkerMapper:
                     placed, waiting = self._place_new(frame, outcome.viewpoint)
                     changed |= placed
         self._consistency.add(frame)
+        if self._owns_map:
+            self._consistency.weigh_map(frame)
         if isinstance(outcome, Location):
             # Also where its pose contradicts the odometry: in fast motion this may be why.
             self.readout.add(outcome, frame.camera, frame.predicted)
@@ -297,6 +299,11 @@ class MarkerMapper:
         self._new.move(self._keyframes.move(refinement.keyframes))
         self.resets += 1
         return True
+
+    @property
+    def doubt_of_map(self) -> str:
+        """Why there is no pose from the map, which most markers contradict; empty if it may be used."""
+        return self._consistency.of_map.doubt
 
     @property
     def candidates(self) -> dict[int, Candidate]:

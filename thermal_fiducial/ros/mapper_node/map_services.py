@@ -93,8 +93,8 @@ class MapServices:
 
     @property
     def doubts(self) -> str:
-        """Warnings: the map's dictionary differs from the detector's, autosaves fail; empty without any."""
-        return '; '.join(filter(None, (self._other_dictionary, self._keeper.fault)))
+        """Warnings: a map of another dictionary, or that most markers contradict; autosaves that fail. Else empty."""
+        return '; '.join(filter(None, (self._other_dictionary, self.mapper.doubt_of_map, self._keeper.fault)))
 
     def remember(self) -> None:
         """Refresh what a mapper that starts again in flight begins with: whether the map is frozen.
