@@ -308,6 +308,13 @@ def test_a_map_in_another_frame_and_parameters_of_others_are_doubted(replay, rec
     assert any('theirs.yaml: nothing in it is for our nodes: it is for their_node' in line for line in lines)
 
 
+def test_a_map_of_other_sides_than_the_parameters_is_doubted(replay, recording, tmp_path):
+    params = tmp_path / 'rig.yaml'
+    params.write_text('/**: {ros__parameters: {marker_size: 0.2}}')
+    _, lines = replay(recording.write(tmp_path / 'bag'), params=params)
+    assert any('map.yaml: no marker has the side of the parameters' in line for line in lines)
+
+
 @pytest.mark.parametrize(
     ('parameters', 'doubted'), [('marker_size: 0.3', True), ('extrinsics: parameters', False), ('', False)]
 )

@@ -1,6 +1,7 @@
 """Marker maps on disk: YAML, written atomically."""
 
 from collections.abc import Mapping
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,9 @@ from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry, read_document
 from thermal_fiducial.files.writing import write_text
+
+# Largest relative difference of two measurements of one side: of 20 mm, by half a millimetre.
+_SAME_SIDE = 0.025
 
 
 def load_map(
@@ -48,6 +52,16 @@ def other_frame(of: str, published: str) -> str:
     return (
         '' if of == published else f'the map is in frame {of!r}, but poses are published in {published!r} (map_frame)'
     )
+
+
+def other_sides(marker_map: MarkerMap, marker_size: float, size_overrides: Mapping[int, float]) -> str:
+    """Warning if no marker of a map has the side [m] that the parameters say: one of both is wrong; else empty."""
+    sides = {key: (marker.size, size_overrides.get(key, marker_size)) for key, marker in marker_map.markers.items()}
+    if not sides or any(math.isclose(*both, rel_tol=_SAME_SIDE) for both in sides.values()):
+        return ''
+    key, (in_map, declared) = next(iter(sides.items()))
+    by = 'marker_size_overrides' if key in size_overrides else 'marker_size'
+    return f'no marker has the side of the parameters: marker {key} is {in_map:g} m in the map, {declared:g} m by {by}'
 
 
 def save_map(path: str | Path, marker_map: MarkerMap) -> None:

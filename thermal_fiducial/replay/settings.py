@@ -26,7 +26,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
-from thermal_fiducial.files.marker_map import load_map, other_frame
+from thermal_fiducial.files.marker_map import load_map, other_frame, other_sides
 from thermal_fiducial.files.parameter_sections import load_sections, mistyped_sections
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
@@ -138,7 +138,8 @@ def _check_files(settings: Settings) -> tuple[str, list[str]]:
         folder = Path(mapper.map_file).parent
         other = other_patterns(marker_map.markers, marker_map.dictionary, settings.aruco_detector.dictionary, folder)
         frame = other_frame(marker_map.frame_id, mapper.map_frame)
-        return marker_map.dictionary, [f'{mapper.map_file}: {doubt}' for doubt in (other, frame) if doubt]
+        sides = other_sides(marker_map, mapper.marker_size, sizes)
+        return marker_map.dictionary, [f'{mapper.map_file}: {doubt}' for doubt in (other, frame, sides) if doubt]
     return '', []
 
 

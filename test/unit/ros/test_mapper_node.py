@@ -68,6 +68,22 @@ def test_a_map_of_another_dictionary_is_used_and_warned_of(graph, map_file, capf
     assert 'has markers of DICT_5X5_50, but dictionary is DICT_4X4_50' in capfd.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ('parameters', 'said'),
+    [
+        ({}, ''),
+        ({'marker_size': 0.15}, 'marker 0 is 0.3 m in the map, 0.15 m by marker_size\n'),
+        ({'marker_size_overrides': ['0:0.984']}, '0.3 m in the map, 0.984 m by marker_size_overrides'),
+        ({'marker_size': 0.15, 'marker_size_overrides': ['0:0.3']}, ''),
+    ],
+)
+def test_a_map_without_any_side_of_the_parameters_is_doubted(graph, map_file, capfd, parameters, said):
+    """In feet, sides included, poses went out that the accelerometer contradicted again and again."""
+    graph.add(MarkerMapperNode, map_file=str(map_file), **parameters)
+    printed = capfd.readouterr().err
+    assert ('no marker has the side of the parameters' in printed, said in printed) == (bool(said), True)
+
+
 def test_a_flight_that_leaves_markers_out_of_the_map_ends_with_why(graph, map_file, capfd):
     """With another side than theirs in marker_size none entered, and console and diagnostics were "ok"."""
     node = graph.add(MarkerMapperNode, map_file=str(map_file))

@@ -17,7 +17,7 @@ from thermal_fiducial.core.wording import listed
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import bring_beside, other_patterns
 from thermal_fiducial.files.map_keeper import MapKeeper
-from thermal_fiducial.files.marker_map import other_frame
+from thermal_fiducial.files.marker_map import other_frame, other_sides
 from thermal_fiducial.files.reading import is_there
 from thermal_fiducial.ros.base.node import Made, StageNode
 from thermal_fiducial.ros.mapper_node.freeze_memory import FreezeMemory
@@ -86,7 +86,8 @@ class MapServices:
         self._node.get_logger().info(f'map of {loaded.size_in_words} from {self._keeper.path}')
         config, folder = self._node.config, self._keeper.path.parent
         self._other_dictionary = other_patterns(loaded.markers, loaded.dictionary, config.dictionary, folder)
-        for doubt in (other_frame(loaded.frame_id, config.map_frame), self._other_dictionary):
+        sides = other_sides(loaded, config.marker_size, size_overrides(config.marker_size_overrides))
+        for doubt in (other_frame(loaded.frame_id, config.map_frame), sides, self._other_dictionary):
             if doubt:
                 self._node.get_logger().warning(doubt)
         return loaded
