@@ -1,15 +1,17 @@
 """Files of ROS parameters: their sections, each for the nodes that its name matches."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from thermal_fiducial.config import meant_node
+from thermal_fiducial.config import meant_node, NODES, parameters
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.plain_yaml import load_plain
 from thermal_fiducial.files.reading import shown
 
 _PARAMETERS = 'ros__parameters'
+# What nodes share in name alone.
+_OWN = ('realtime_priority', 'image_rate')
 
 
 def load_sections(path: Path) -> dict[str, dict[str, Any]]:
@@ -53,6 +55,40 @@ def sections_outside(sections: Mapping[str, Mapping[str, Any]], node: str) -> It
                 f'section {shown(section)}: ROS ignores it, as it is for a node without a namespace; '
                 f'for {node} write {node} or /**/{name}'
             )
+
+
+def values_for(sections: Mapping[str, Mapping[str, Any]], node: str, seconds: Collection[str] = ()) -> dict[str, Any]:
+    """Values of a node of the first camera by name; sections in the namespaces of ``seconds`` do not apply to it."""
+    return joined(sections, node, (name for name in sections if not set(seconds) & set(name.split('/')[:-1])))
+
+
+def joined(sections: Mapping[str, Mapping[str, Any]], node: str, names: Iterable[str]) -> dict[str, Any]:
+    """Values of a node from those of the sections ``names`` that are meant for it or for all; the last counts."""
+    values: dict[str, Any] = {}
+    for name in names:
+        if name.rpartition('/')[2] in ('**', '*', node):
+            values |= sections[name]
+    return values
+
+
+def values_of_others(
+    sections: Mapping[str, Mapping[str, Any]], node: str, seconds: Collection[str] = ()
+) -> Iterator[str]:
+    """A warning for each other node whose sections alone have what ``node`` needs too, as the camera's place."""
+    if node not in NODES:
+        return
+    defaults = {name: default for name, _, default in parameters(NODES[node]) if name not in _OWN}
+    own = defaults | values_for(sections, node, seconds)
+    for other in (name for name in NODES if name != node):
+        theirs = values_for(sections, other, seconds)
+        shared = {name for name, _, _ in parameters(NODES[other])} & defaults.keys() & theirs.keys()
+        apart = sorted(name for name in shared if _plain(theirs[name]) != _plain(own[name]))
+        if apart:
+            yield f'{", ".join(apart)}: {other} has other values than {node}; write them into the section /** for both'
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _sections(path: Path, document: Mapping[str, Any], namespace: str) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -1,6 +1,6 @@
 """Parameters of a replay: those of the nodes from a ROS parameter file, checked before anything starts."""
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,7 +27,13 @@ from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
 from thermal_fiducial.files.marker_map import load_map, other_frame, other_sides
-from thermal_fiducial.files.parameter_sections import load_sections, mistyped_sections
+from thermal_fiducial.files.parameter_sections import (
+    joined,
+    load_sections,
+    mistyped_sections,
+    values_for,
+    values_of_others,
+)
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
 
@@ -79,15 +85,16 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any], second_came
     named = (section.get('second_camera') for section in (*document.values(), overrides))
     seconds = {str(name) for name in named if name}
     with nullcontext() if params is None else naming(params):
-        configs = {node: _config(node, _values_for(node, document, seconds), overrides) for node in NODES}
+        configs = {node: _config(node, values_for(document, node, seconds), overrides) for node in NODES}
         settings = Settings(**configs)
         if second_camera:
             own = (_config(node, _values_for_second(node, document, second_camera), overrides) for node in OF_CAMERA)
             settings = replace(settings, second=tuple(own))
     map_dictionary, warnings = _check_files(settings)
-    if document and not any(_values_for(node, document, seconds) for node in NODES):
+    if document and not any(values_for(document, node, seconds) for node in NODES):
         warnings.append(f'{params}: nothing in it is for our nodes: it is for {", ".join(document)}')
     doubts = [line for _, line in mistyped_sections(document)]
+    doubts += (line for node in NODES for line in values_of_others(document, node, seconds))
     warnings += [f'{params}: {doubt}' for doubt in (*doubts, *_whole_numbers(document))]
     return replace(settings, map_dictionary=map_dictionary, warnings=tuple(warnings))
 
@@ -158,24 +165,9 @@ def _config(node: str, values: dict[str, Any], overrides: Mapping[str, Any]) -> 
     return from_mapping(NODES[node], values | dict(overrides))
 
 
-def _values_for(node: str, document: Mapping[str, Mapping[str, Any]], seconds: Collection[str]) -> dict[str, Any]:
-    """Values of a node of the first camera: entries in the namespaces of ``seconds`` do not apply to it."""
-    patterns = [pattern for pattern in document if not set(seconds) & set(pattern.split('/')[:-1])]
-    return _joined(node, document, patterns)
-
-
 def _values_for_second(node: str, document: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, Any]:
     """Values of a node of the second camera ``name``: those in its namespace, and those for any namespace."""
-    patterns = [pattern for pattern in document if {'**', name} & set(pattern.split('/'))]
-    return _joined(node, document, patterns)
-
-
-def _joined(node: str, document: Mapping[str, Mapping[str, Any]], patterns: Iterable[str]) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for pattern in patterns:
-        if pattern.rsplit('/', 1)[-1] in ('**', '*', node):
-            values |= document[pattern]
-    return values
+    return joined(document, node, (section for section in document if {'**', name} & set(section.split('/'))))
 
 
 def _plain(value: Any) -> Any:

@@ -151,6 +151,37 @@ def test_a_node_warns_of_what_its_file_has_twice(tmp_path, added, what):
         read_settings(file, {})
 
 
+@pytest.mark.parametrize(
+    ('sections', 'apart'),
+    [
+        ({'pose_ekf': {'camera_position': [0.1, 0, 0]}}, ['aruco_detector', 'marker_mapper']),
+        ({'/**': {'camera_position': [0.1, 0, 0]}, '/pose_ekf': {'camera_position': [0.1, 0.0, 0]}}, []),
+        ({'/**': {'camera_position': [0.1, 0, 0]}, 'marker_mapper': {'dictionary': 'DICT_5X5_50'}}, ['aruco_detector']),
+        ({'marker_mapper': {'second_camera': 'right'}, 'right/aruco_detector': {'camera_position': [0.1, 0, 0]}}, []),
+        ({'pose_ekf': {'realtime_priority': 5, 'gate': 30.0}}, []),
+    ],
+)
+def test_what_one_node_alone_has_of_shared_parameters_is_warned_of(tmp_path, sections, apart):
+    """The mapper predicted with a camera in the IMU, as its place was in the section of the filter."""
+    file = tmp_path / 'rig.yaml'
+    file.write_text(yaml.safe_dump({section: {'ros__parameters': values} for section, values in sections.items()}))
+    lines = list(read_settings(file, {}).warnings)
+    assert [node for node in NODES for line in lines if f'other values than {node};' in line] == apart
+    given = ['--ros-args', '--params-file', str(file)]
+    assert [node for node in NODES for line in params.doubts_of_files(f'/{node}', given) if line in lines] == apart
+
+
+def test_values_of_another_robot_in_the_same_file_are_its_own(tmp_path):
+    file, given = tmp_path / 'rig.yaml', ['--ros-args', '--params-file', str(tmp_path / 'rig.yaml')]
+    file.write_text(
+        '/a/**: {ros__parameters: {camera_position: [0.1, 0, 0]}}\n'
+        '/b/pose_ekf: {ros__parameters: {camera_position: [0.2, 0, 0]}}\n'
+    )
+    assert list(params.doubts_of_files('/a/marker_mapper', given)) == []
+    (line,) = params.doubts_of_files('/b/marker_mapper', given)
+    assert 'camera_position: pose_ekf has other values than marker_mapper' in line
+
+
 def test_namespaces_may_be_nested_as_in_ros(tmp_path):
     """A replay refused a file with which the nodes fly."""
     file = tmp_path / 'rig.yaml'

@@ -13,7 +13,12 @@ from rclpy.parameter import Parameter
 
 from thermal_fiducial.config import check_names, Config, for_whole_numbers, from_mapping, parameters, QOS_OVERRIDES
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
-from thermal_fiducial.files.parameter_sections import load_sections, mistyped_sections, sections_outside
+from thermal_fiducial.files.parameter_sections import (
+    load_sections,
+    mistyped_sections,
+    sections_outside,
+    values_of_others,
+)
 
 _ARRAYS = {
     float: Parameter.Type.DOUBLE_ARRAY,
@@ -54,7 +59,8 @@ def declare(node: Node, kind: type[Config]) -> Config:
 def doubts_of_files(node: str, args: Sequence[str]) -> Iterator[str]:
     """A warning for each of the parameter files in ``args`` that a replay refuses, as it has a parameter twice.
 
-    And for each section in them that is meant for ``node``, but ignored by ROS. A node that was given another name has
+    And for each section in them that is meant for ``node``, but ignored by ROS, and for values that another node alone
+    has there. A node that was given another name has
     none: only who gave it knows how it is spelt. Nor has one of a second camera for sections without a namespace, which
     are for the first.
 
@@ -71,12 +77,21 @@ def doubts_of_files(node: str, args: Sequence[str]) -> Iterator[str]:
         except InputError as error:
             # ROS has read the file: a node that starts again in flight must not end for it.
             yield f'{error}: ROS reads the file all the same, and of two takes the last'
-    seconds = {values.get('second_camera') for sections in files.values() for values in sections.values()}
+    seconds = {str(values.get('second_camera')) for sections in files.values() for values in sections.values()}
     is_second = namespace.rpartition('/')[2] in seconds
     for file, sections in files.items():
         mistyped = (line for meant, line in mistyped_sections(sections) if meant == name)
         outside = () if is_second else sections_outside(sections, node)
-        yield from (f'{file}: {line}' for line in (*mistyped, *outside))
+        apart = () if is_second else values_of_others(_in_reach(sections, namespace), name, seconds)
+        yield from (f'{file}: {line}' for line in (*mistyped, *outside, *apart))
+
+
+def _in_reach(sections: dict[str, dict[str, Any]], namespace: str) -> dict[str, dict[str, Any]]:
+    """Sections that nodes of a namespace read: its own, and those for any; a file may be of several robots."""
+    spaces = {section: section.strip('/').rpartition('/')[0] for section in sections}
+    own = {section for section, space in spaces.items() if space == namespace.strip('/')}
+    for_any = {section for section, space in spaces.items() if space in ('**', '*') or section in ('/**', '**')}
+    return {section: values for section, values in sections.items() if section in own | for_any}
 
 
 def follow(node: Node, kind: type[Config], apply: Callable[[Config], None]) -> None:
