@@ -12,6 +12,7 @@ import math
 import os
 import re
 from typing import Any, get_args, TypeVar
+from urllib.parse import unquote
 
 from thermal_fiducial.errors import InputError
 
@@ -63,7 +64,7 @@ def param(
     length : number of elements of a tuple of floats
     normed : whether the tuple must have unit norm (a quaternion)
     verify : called with the value; raises InputError if it is unusable
-    form : makes the value of a string: :func:`from_home` of a path, :func:`frame_name` of the name of a frame
+    form : makes the value of a string: :func:`local_path` of a path, :func:`frame_name` of the name of a frame
     dynamic : whether it may be set while the node runs; otherwise it is declared read-only
     needs : parameters of the same node without which this one has no effect
     """
@@ -183,11 +184,13 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
     return result
 
 
-def from_home(path: str) -> str:
-    """``path`` with the user's home for a leading ~, since no shell replaces it in a parameter file.
+def local_path(path: str) -> str:
+    """``path`` of a file: of a URL, as the ``camera_info_url`` of ROS is one, and with the home for a leading ~.
 
-    An unknown user's stays, and so does an empty path.
+    No shell replaces ~ in a parameter file. An unknown user's stays, and so does an empty path.
     """
+    if url := re.fullmatch(r'file:(?://(?:localhost)?)?(/[^/].*)', path, re.DOTALL):
+        return unquote(url[1])
     return os.path.expanduser(path)  # noqa: PTH111 - pathlib makes '.' of '' and fails for an unknown user
 
 
@@ -337,7 +340,7 @@ def _camera_orientation(frame: str = 'thermal_camera_optical', needs: tuple[str,
 
 def _calibration_file(if_empty: str) -> Any:
     return param(
-        '', f'Camera calibration (camera_info YAML), published with each image. Empty: {if_empty}.', form=from_home
+        '', f'Camera calibration (camera_info YAML), published with each image. Empty: {if_empty}.', form=local_path
     )
 
 
@@ -349,7 +352,7 @@ class MarkerParameters(SelfChecked):
         'DICT_4X4_50',
         'Dictionary of the markers: a name of OpenCV or of this package (STENCIL_4X4_100 is the default of '
         '"markers make"), or the path of a dictionary file.',
-        form=from_home,
+        form=local_path,
     )
     marker_size: float = param(
         0.30, 'Side of the black square of a marker.', unit='m', minimum=SMALLEST_SIDE, maximum=LARGEST_SIDE
@@ -471,7 +474,7 @@ class Tau2CameraConfig(ImageRateParameters, FrameParameters, ImageParameters):
         choices=('raw', 'compressed'),
     )
     bad_pixel_file: str = param(
-        '', 'List of dead pixels: a text file, "column row" a line. Empty: none.', form=from_home
+        '', 'List of dead pixels: a text file, "column row" a line. Empty: none.', form=local_path
     )
     find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.', dynamic=True)
     bits: int = param(
@@ -629,7 +632,7 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
 class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, MountErrorParameters, MarkerParameters):
     """The incremental marker map."""
 
-    map_file: str = param('', 'Marker map (YAML). Empty: no map.', form=from_home)
+    map_file: str = param('', 'Marker map (YAML). Empty: no map.', form=local_path)
     mode: str = param(
         'mapping',
         'mapping: new markers enter the map; localization: the map never changes.',
@@ -649,12 +652,12 @@ class MarkerMapperConfig(ImageRateParameters, ClockParameters, FrameParameters, 
     # Without a second camera it still concerns the filter, and may stand in the file of parameters of all nodes.
     time_offset_random_walk: float = _clock_random_walk(())
     cloud_file: str = param(
-        '', 'Point cloud of the site (.ply or .pcd) to publish for RViz. Empty: none.', form=from_home
+        '', 'Point cloud of the site (.ply or .pcd) to publish for RViz. Empty: none.', form=local_path
     )
     cloud_alignment_file: str = param(
         '',
         'Transform from the map to the frame of cloud_file, written by map align. Empty: the frames are the same.',
-        form=from_home,
+        form=local_path,
         needs=('cloud_file',),
     )
     marker_size_std: float = param(
@@ -925,7 +928,7 @@ class ThermalSourceConfig(FrameParameters, ImageParameters):
         '',
         'Source of the frames: a V4L2 device (/dev/video0), a TeAx ThermalGrabber ("teax", or "teax:SERIAL" if there '
         'are several), or a folder, picture or video of 16 bits.',
-        form=from_home,
+        form=local_path,
     )
     image_width: int = param(0, 'Requested width; 0: as the camera is set.', unit='px', minimum=0, maximum=4096)
     image_height: int = param(0, 'Requested height; 0: as the camera is set.', unit='px', minimum=0, maximum=4096)

@@ -10,11 +10,11 @@ from thermal_fiducial import config
 from thermal_fiducial.config import (
     ArucoDetectorConfig,
     check_names,
-    from_home,
     from_mapping,
     group,
     ImuNoise,
     LandingTargetConfig,
+    local_path,
     MarkerMapperConfig,
     param,
     parameters,
@@ -278,9 +278,28 @@ def test_a_path_may_begin_at_home(monkeypatch):
     assert camera.frame_id == '~camera'
 
 
+@pytest.mark.parametrize(
+    ('given', 'path'),
+    [
+        ('file:///maps/hall.yaml', '/maps/hall.yaml'),
+        ('file://localhost/maps/hall.yaml', '/maps/hall.yaml'),
+        ('file:/maps/hall%201.yaml', '/maps/hall 1.yaml'),
+        ('/maps/hall%201.yaml', '/maps/hall%201.yaml'),
+        ('file:hall.yaml', 'file:hall.yaml'),
+        ('file://other/hall.yaml', 'file://other/hall.yaml'),
+        ('a[b', 'a[b'),
+        ('//[a', '//[a'),
+    ],
+)
+def test_a_file_may_be_a_url(given, path):
+    """Of file:///maps/hall.yaml two slashes were lost, and file:/maps/hall.yaml was not found."""
+    assert MarkerMapperConfig(map_file=given).map_file == path
+    assert from_mapping(Tau2CameraConfig, {'calibration_file': given}).calibration_file == path
+
+
 def test_every_file_is_a_path():
     files = {name for kind in NODES for name, _, _ in parameters(kind) if name.endswith('_file')}
-    paths = {name for kind in NODES for name, item, _ in parameters(kind) if item.metadata['form'] is from_home}
+    paths = {name for kind in NODES for name, item, _ in parameters(kind) if item.metadata['form'] is local_path}
     assert files
     assert paths == files | {'dictionary', 'camera'}
 

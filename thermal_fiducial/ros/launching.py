@@ -21,7 +21,7 @@ from launch.launch_description import LaunchDescription
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from thermal_fiducial.config import from_home, NODES, OF_CAMERA, SHARED_WITH_SECOND_CAMERA
+from thermal_fiducial.config import local_path, NODES, OF_CAMERA, SHARED_WITH_SECOND_CAMERA
 from thermal_fiducial.errors import InputError
 
 PACKAGE = 'thermal_fiducial'
@@ -195,7 +195,7 @@ def _ids(text: str) -> list[int]:
 
 def _params_file(path: str, share: Path) -> str:
     # Shells replace the ~ at the beginning of a word only, not behind params_file:=
-    path = from_home(path)
+    path = local_path(path)
     if path and not Path(path).is_file():
         raise InputError(f'params_file {path}: no such file')
     return path or str(share / 'config' / f'{PACKAGE}.yaml')
