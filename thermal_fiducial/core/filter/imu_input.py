@@ -7,6 +7,7 @@ import math
 
 from thermal_fiducial.core.filter.camera_clock import SMALLEST_STEP_NS
 from thermal_fiducial.core.measurements import Condition, ImuSample
+from thermal_fiducial.core.stamp_clock import NO_CLOCK, StampClock
 from thermal_fiducial.core.types import SECOND_NS
 
 #: Samples in a row that must follow each other after a jump: for a stepped clock, and for the end of a gap.
@@ -38,6 +39,7 @@ class Verdict(Enum):
     IMPOSSIBLE = Condition('IMU sample far beyond the range of its sensors')
     FROZEN = Condition('IMU is frozen', 'the same value again and again')
     REPEATED = Condition('IMU stamp repeated', 'two publishers, or a driver that sets none?')
+    NO_CLOCK = Condition('IMU has no clock', NO_CLOCK)
     BACKWARD = Condition('IMU stamp went back')
     AHEAD = Condition('IMU stamp jumped ahead')
     RESTART = Condition('IMU clock jumped', 'reset')
@@ -90,6 +92,7 @@ class ImuInput:
         self._limits = [IMPOSSIBLE_RANGES * full_scale for full_scale in ranges]
         saturated = [math.inf] * 3 + [SATURATED_SECONDS] * 3
         self._axes = [Axis(*of_axis) for of_axis in zip(ranges, saturated, strict=True)]
+        self._clock = StampClock()
         self._last_ns: int | None = None
         #: the last samples that were used, which may come once more
         self._used: deque[tuple[int, list[float]]] = deque(maxlen=CLOCK_EVIDENCE)
@@ -111,6 +114,8 @@ class ImuInput:
             return Verdict.NOT_FINITE
         if any(abs(value) > limit for value, limit in zip(values, self._limits, strict=True)):
             return Verdict.IMPOSSIBLE
+        if self._clock.stands(sample.stamp_ns):
+            return Verdict.NO_CLOCK
         frozen = [axis.is_frozen(sample.stamp_ns, value) for axis, value in zip(self._axes, values, strict=True)]
         if any(frozen):
             return Verdict.FROZEN

@@ -17,6 +17,7 @@ from thermal_fiducial.core.camera_frames import FramePeriod, pixel_noise
 from thermal_fiducial.core.geometry.plausibility import require_image
 from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder
 from thermal_fiducial.core.measurements import LATEST_NS
+from thermal_fiducial.core.stamp_clock import NO_CLOCK, StampClock
 from thermal_fiducial.core.types import Counts, Gray, IntArray
 from thermal_fiducial.errors import InputError
 
@@ -86,6 +87,7 @@ class FrameCleaner:
     def _restart(self, shape: tuple[int, int]) -> None:
         self._filler = BadPixelFiller(self._known_bad, shape) if shape != (0, 0) else None
         self._shape = shape
+        self._clock = StampClock()
         self._stamps: set[int] = set()
         self._newest_ns = 0
         self._pauses = Pauses()
@@ -122,6 +124,8 @@ class FrameCleaner:
             self._restart(image.shape)
         if stamp_ns in self._stamps:
             return CleanFrame(None, REPEATED_STAMP)
+        if self._clock.stands(stamp_ns):
+            return CleanFrame(None, NO_CLOCK)
         late = stamp_ns < self._newest_ns
         self._newest_ns = max(stamp_ns, self._newest_ns)
         self._stamps = {stamp for stamp in self._stamps if stamp >= self._newest_ns - LATEST_NS} | {stamp_ns}
