@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.subcommands import file_to_write
+from thermal_fiducial.cli.subcommands import file_to_write, warn
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.page import evaluate_run, require_packages, VIDEO, write_page
 from thermal_fiducial.report.run_folder import Run
@@ -60,6 +60,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_report:
         require_packages()
     evaluation, numbers = evaluate_run(args.folders[0], args.truth, args.truth_map)
+    if evaluation.doubt_of_truth:
+        warn(evaluation.doubt_of_truth)
     if args.video:
         make_video(evaluation.run, args.bag)
     page = None if args.no_report else write_page(evaluation, numbers, args.bag)

@@ -17,6 +17,9 @@ from thermal_fiducial.report.tags import Tag, tags
 
 #: Sampling interval of the NEES [ns]: errors are correlated over time, so denser samples add no evidence.
 CONSISTENCY_NS = 100_000_000
+# How many times closer to the run attitudes in another order are where the order is the likely cause: those of a usable
+# run are within a degree or two, and 180 deg off in the wrong order where the robot is level.
+_TIMES_CLOSER = 50.0
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,20 @@ class Evaluation:
     def tags(self) -> list[Tag]:
         """One row per marker."""
         return tags(self.run)
+
+    @cached_property
+    def doubt_of_truth(self) -> str:
+        """That the ground truth seems to have its quaternions in the order w x y z, in words; empty if it has not."""
+        e = self.fused_errors
+        if e is None or not len(e):
+            return ''
+        as_read, reordered = metrics.rms(e.attitude_deg), metrics.attitude_in_other_order(e)
+        if as_read <= _TIMES_CLOSER * reordered:
+            return ''
+        apart = (
+            f'The attitude is {as_read:.0f} deg off, and {reordered:.2g} deg with the quaternions of the ground truth'
+        )
+        return f'{apart} as w x y z: they must be x y z w.'
 
     @property
     def start_ns(self) -> int:

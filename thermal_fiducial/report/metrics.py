@@ -16,7 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.se3 import apply, inverse, rigid_alignment, so3_exp, so3_log, transform
+from thermal_fiducial.core.geometry.se3 import (
+    apply,
+    inverse,
+    quaternion_from_rotation,
+    rigid_alignment,
+    rotation_from_quaternion,
+    so3_exp,
+    so3_log,
+    transform,
+)
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.files.innovations import Innovations
 from thermal_fiducial.report.trajectory import Trajectory
@@ -137,6 +146,13 @@ def other_unit(e: Errors) -> tuple[str, float]:
         if rms(np.linalg.norm(rigid_residuals(p_hat, p_true / count), axis=1)) < _RESIDUAL_OF_UNIT * extent:
             return unit, count
     return '', 1.0
+
+
+def attitude_in_other_order(e: Errors) -> float:
+    """Rms error of the attitude [deg] with the truth's quaternions read as w x y z."""
+    as_read = quaternion_from_rotation(e.truth[:, :3, :3])
+    R = rotation_from_quaternion(np.roll(as_read, -1, axis=-1))
+    return rms(np.rad2deg(np.linalg.norm(so3_log(R @ np.swapaxes(e.estimate[:, :3, :3], 1, 2)), axis=1)))
 
 
 def rigid_residuals(p_hat: FloatArray, p_true: FloatArray) -> FloatArray:

@@ -70,6 +70,7 @@ def judge(evaluation: Evaluation, numbers: dict[str, Any]) -> RunVerdict:
     made = [
         _output(evaluation, numbers),
         _error(evaluation, numbers),
+        _truth(evaluation),
         _consistency(numbers),
         _refused(numbers),
         _steps(numbers),
@@ -115,6 +116,10 @@ def _error(evaluation: Evaluation, numbers: dict[str, Any]) -> Remark | None:
         f'Errors against ground truth: {error["position_rms_mm"]:.1f} mm and {error["attitude_rms_deg"]:.2f} deg rms, '
         f'{error["position_max_mm"]:.0f} mm at the worst, each pose at its own stamp.',
     )
+
+
+def _truth(evaluation: Evaluation) -> Remark | None:
+    return Remark(Weight.DOUBT, evaluation.doubt_of_truth) if evaluation.doubt_of_truth else None
 
 
 def _consistency(numbers: dict[str, Any]) -> Remark | None:

@@ -6,10 +6,11 @@ import json
 
 import numpy as np
 import pytest
-from support.run_folders import FIDUCIAL_SIGMA, FUSED_SIGMA, make_run, trajectory, wall, write_truth_bag
+from support.run_folders import FIDUCIAL_SIGMA, FUSED_SIGMA, make_run, run_of, trajectory, wall, write_truth_bag
 import yaml
 
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.geometry.se3 import so3_exp
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import save_map
@@ -250,6 +251,28 @@ def test_a_bad_run_is_not_a_truth_in_another_unit(scale):
     poses = truth.T_map_body.copy()
     poses[:, :3, 3] *= scale
     assert other_unit(errors(Trajectory(truth.stamps_ns, poses), truth)) == ('', 1.0)
+
+
+def test_truth_with_w_before_x_y_z_is_named(small_run, capsys):
+    """The attitude was 179 deg off, and nothing said why."""
+    truth = small_run / 'truth.tum'
+    stamps, positions, quaternions = load_tum(truth)
+    save_tum(truth, stamps.tolist(), positions, np.roll(quaternions, 1, axis=1))
+    assert main(['evaluate', str(small_run)]) == 0
+    said = 'with the quaternions of the ground truth as w x y z: they must be x y z w.'
+    assert said in capsys.readouterr().err
+    assert any(said in remark.text for remark in judge(*evaluate_run(small_run)).remarks)
+
+
+@pytest.mark.parametrize('turn_deg', [0.0, 3.0, 90.0, 120.0, 180.0])
+@pytest.mark.parametrize('axis', [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.577, 0.577, 0.577)])
+def test_a_run_with_a_wrong_attitude_is_not_a_truth_in_another_order(tmp_path, turn_deg, axis):
+    """As one whose camera_orientation is wrong."""
+    truth = trajectory(100.0)
+    poses = truth.T_map_body.copy()
+    poses[:, :3, :3] = poses[:, :3, :3] @ so3_exp(np.deg2rad(turn_deg) * np.array(axis))
+    turned = Trajectory(truth.stamps_ns, poses)
+    assert evaluate(run_of(tmp_path, turned, turned)).doubt_of_truth == ''
 
 
 @pytest.mark.parametrize(('count', 'words'), [(0, 'no pose'), (1, '1 pose'), (2, '2 poses')])
