@@ -62,12 +62,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     _replace_closed_streams()
     _allow_any_letter()
-    with Interrupts(held=False) as interrupts:
-        status = _finished(words, interrupts)
-    if argv is None and status == INTERRUPTED:
-        # All is cleared up: a further interrupt may end the process in the middle of the interpreter's own end.
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
-    return status
+    # All is cleared up then: a further interrupt may end the process in the middle of the interpreter's own end.
+    with Interrupts(held=False, behind=signal.SIG_DFL if argv is None else None) as interrupts:
+        return _finished(words, interrupts)
 
 
 def _finished(argv: Sequence[str], interrupts: Interrupts) -> int:

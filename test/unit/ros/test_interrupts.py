@@ -5,6 +5,7 @@ import signal
 import threading
 
 import pytest
+from support.empty_stage import finished
 
 from thermal_fiducial.cli import main as program
 from thermal_fiducial.ros.process import interrupts
@@ -115,3 +116,31 @@ def test_a_command_says_that_it_was_interrupted_whatever_a_library_makes_of_it(m
     monkeypatch.setattr(program, '_run', convert)
     assert program.main(['replay']) == 130
     assert capsys.readouterr().err == 'thermal-fiducial replay: interrupted\n'
+
+
+def test_a_second_one_at_the_very_end_prints_no_traceback():
+    """Between the handler of the command and none, Python's own was there: one in eight double presses met it."""
+    done = finished(
+        """
+import os, signal, sys
+from thermal_fiducial.cli import main as program
+
+own, calls = signal.signal, []
+
+def press(*_):
+    os.kill(os.getpid(), signal.SIGINT)
+
+def press_behind_the_end(number, handler):
+    before = own(number, handler)
+    calls.append(handler)
+    if len(calls) == 2:
+        press()
+    return before
+
+own(signal.SIGINT, signal.default_int_handler)
+signal.signal, program._run = press_behind_the_end, press
+sys.exit(program.main())
+""",
+        'replay',
+    )
+    assert (done.returncode, done.stderr) == (-signal.SIGINT, 'thermal-fiducial replay: interrupted\n')
