@@ -54,7 +54,8 @@ def flight():
 
 
 def message(item, start_ns):
-    head = convert.header(item.stamp_ns - START_NS + start_ns, 'base_link')
+    frame = 'base_link' if isinstance(item, ImuSample) else 'map'
+    head = convert.header(item.stamp_ns - START_NS + start_ns, frame)
     if not isinstance(item, ImuSample):
         return pose_with_covariance(item.T_map_camera, item.covariance, head)
     return Imu(

@@ -54,7 +54,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
     def _on_camera_pose(self, message: bytes) -> None:
         self.take_waiting()
         self._imu.measure()
-        pose = self._corrections.in_present_map(message_bytes.camera_pose(message))
+        pose = self._corrections.in_present_map(message_bytes.camera_pose(message, self.config.map_frame))
         update = self.filter.add_pose(pose)
         self._status.after_pose(update)
         self._outputs.send_clock(update.stamp_ns, self.filter.camera_time_offset)

@@ -628,6 +628,22 @@ def test_an_invalid_camera_pose_is_refused(graph):
     assert 'unit quaternion' in graph.diagnose(node)[1]
 
 
+@pytest.mark.parametrize(
+    ('frame', 'map_frame', 'taken'),
+    [('map', 'map', True), ('/map', 'map', True), ('', 'hall', True), ('odom', 'map', False), ('map', 'hall', False)],
+)
+def test_a_camera_pose_in_another_frame_is_refused(graph, frame, map_frame, taken):
+    """Of another localizer, say: poses in its frame went out as poses in the map."""
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], map_frame=map_frame)
+    sent = [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])]
+    for message in sent:
+        message.header.frame_id = message.header.frame_id if isinstance(message, Imu) else frame
+    fly(graph, sent)
+    said = f"camera_pose in frame '{frame}', and not in that of the map: map_frame is '{map_frame}'"
+    reason = graph.diagnose(node)[1]
+    assert (reason == 'tracking', said in reason) == (taken, not taken)
+
+
 def test_reset_starts_anew(graph):
     node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
     fly(graph, [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])

@@ -99,14 +99,21 @@ def imu_sample(message: bytes) -> ImuSample:
     )
 
 
-def camera_pose(message: bytes) -> CameraPose:
+def camera_pose(message: bytes, map_frame: str = '') -> CameraPose:
     """Camera pose in the map.
+
+    Parameters
+    ----------
+    message : serialised
+    map_frame : name of the map's frame, which that of the pose must have if it has one; empty: any
 
     Raises
     ------
     InputError
-        Another encoding, a truncated message, or an invalid pose or covariance.
+        Another encoding, a truncated message, an invalid pose or covariance, or another frame.
     """
+    if map_frame and (frame := frame_id(message).lstrip('/')) not in ('', map_frame):
+        raise InputError(f'camera_pose in frame {frame!r}, and not in that of the map: map_frame is {map_frame!r}')
     return _camera_pose(message, 'camera_pose', partial=False)
 
 
