@@ -218,6 +218,16 @@ def test_a_missing_camera_info_is_reported_until_it_comes(graph):
     assert (level, figures['published /markers']) == (OK, '1')
 
 
+@pytest.mark.parametrize('kind', [ArucoDetector, MarkerMapperNode])
+def test_a_calibration_that_was_sent_once_before_the_node_began_is_taken(graph, kind):
+    """Of a latched publisher: a detector that was started again in flight never had one any more."""
+    graph.tester.advertise(CameraInfo, 'thermal/camera_info', qos.LATCHED).send(info())
+    node = graph.add(kind, live=True)
+    graph.spin_until(lambda: node.take_waiting() or node.figures()['calibrations'] == 1)
+    # The subscription that it takes for this says nothing of a driver that repeats its own.
+    assert [source.regular for source in node.inputs if source.topic == '/thermal/camera_info'] == [True, False]
+
+
 def test_a_map_that_rests_and_a_view_without_markers_are_no_doubts_of_the_detector(graph):
     """A map that has changed in each of five seconds, and the clock offset, which comes with poses, stop."""
     node = graph.add(ArucoDetector)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from nav_msgs.msg import Odometry as OdometryMessage
-from sensor_msgs.msg import CameraInfo, TimeReference
+from sensor_msgs.msg import TimeReference
 
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
@@ -34,7 +34,7 @@ class CameraStageNode(StageNode[CameraConfig]):
 
         Call it after subscribing to the node's main input.
         """
-        self.subscribe_lazily(CameraInfo, 'thermal/camera_info', self._calibration.take, qos.CAMERA_INPUT)
+        self._calibration.follow('thermal/camera_info')
         self.subscribe_lazily(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT)
         RobotFrames(self)
         # One for each pose of a camera: that there are none is for the filter to say.

@@ -2,16 +2,22 @@
 
 from typing import Any
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.qos import DurabilityPolicy
 from sensor_msgs.msg import CameraInfo
 
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import doubt_of_resolution
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import StageNode
 from thermal_fiducial.ros.messages import convert, message_bytes
 
 # Messages of one calibration after which an earlier one is no longer expected to come back: ten seconds at 30 Hz.
 _SETTLED = 300
+# Time between looks for a publisher that sends none, as it has sent its only one before this node was there [s].
+_LOOK_S = 1.0
 
 
 class LatestCalibration:
@@ -35,6 +41,26 @@ class LatestCalibration:
         self._doubt = ''
         #: number of different calibrations received
         self.count = 0
+
+    def follow(self, topic: str) -> None:
+        """Subscribe to a topic, and where its publisher is latched and sent the only message before, to that too.
+
+        Not at once as a latched subscription: it would match no driver that repeats its calibration.
+        """
+        node, take = self._node, self.take
+        node.subscribe_lazily(CameraInfo, topic, take, qos.CAMERA_INPUT)
+        if not node.live:
+            return
+
+        def look() -> None:
+            publishers = [] if self._camera else node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+            if any(each.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in publishers):
+                node.subscribe_lazily(CameraInfo, topic, take, qos.LATCHED).regular = False
+                timer.cancel()
+            elif self._camera:
+                timer.cancel()
+
+        timer = node.create_timer(_LOOK_S, look, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def camera(self) -> Camera:
         """The calibration.

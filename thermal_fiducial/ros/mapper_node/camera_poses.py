@@ -4,7 +4,7 @@ from dataclasses import replace
 import math
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from sensor_msgs.msg import CameraInfo, PointCloud2
+from sensor_msgs.msg import PointCloud2
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import covariance_of_mount
@@ -48,7 +48,7 @@ class CameraPoses:
             self._second = _second_of(node.config)
             self._locator = MarkerMapper(_alone(node.config), mapper.map)
             node.subscribe_newest(PointCloud2, f'{name}/markers', self._on_second, qos.RESULT, raw=True)
-            node.subscribe_lazily(CameraInfo, f'{name}/thermal/camera_info', self._calibration.take, qos.CAMERA_INPUT)
+            self._calibration.follow(f'{name}/thermal/camera_info')
 
     def configure(self) -> None:
         """Apply dynamic parameters; only a camera that has moved on the robot makes the clocks' difference unknown."""
