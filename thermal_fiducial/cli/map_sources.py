@@ -171,7 +171,9 @@ def _grow(
         raise InputError(f'{work.source}: no frame of it gives a pose in the map; {work.path} is left as it is')
     work.save(built.map)
     print(f'{work.path}: {built.map.size_in_words}')
-    return 2 if any(doubt.spoils for doubt in say_doubts(built.map, work.path)) else 0
+    if built.contradiction:
+        warn(built.contradiction)
+    return 2 if any(doubt.spoils for doubt in say_doubts(built.map, work.path)) or built.contradiction else 0
 
 
 def say_doubts(marker_map: MarkerMap, path: Path) -> list[Doubt]:

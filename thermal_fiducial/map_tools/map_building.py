@@ -43,6 +43,8 @@ class Built:
     frames_used: int
     #: index of each other frame, with the reason
     unused: dict[int, str] = field(default_factory=dict)
+    #: that most markers contradict the map to start from, in words; empty if they do not
+    contradiction: str = ''
 
 
 def build_map(
@@ -87,7 +89,7 @@ def build_map(
         mapper.apply(refinement)
     used = [rows for k, rows in enumerate(frames) if k not in unused]
     final = _with_statistics(mapper.map, used, marker_map, errors)
-    return Built(final, refinement, unplaced, len(used), unused)
+    return Built(final, refinement, unplaced, len(used), unused, mapper.doubt_of_map)
 
 
 def _stamp(k: int) -> int:

@@ -391,6 +391,15 @@ def detections(poses, side=SIZE):
     return f'stamp_ns,id,{",".join(CORNER_FIELDS)},sigma_px\n' + '\n'.join(lines)
 
 
+@pytest.mark.parametrize(('unit', 'status'), [(1.0, 0), (1.0 / 0.3048, 2)])
+def test_refine_names_the_factor_of_a_map_in_another_unit(path, poses, photographed, capsys, unit, status):
+    """A list of quarantined markers was all that it said, and a script went on."""
+    in_unit = {key: transform(T[:3, :3], unit * T[:3, 3]) for key, T in poses.items()}
+    save_map(path, MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in in_unit.items()}))
+    assert run('refine', path, *photographed) == status
+    assert ('distances in the map are 3.28 times those seen' in capsys.readouterr().err) == (status == 2)
+
+
 def test_refine_counts_the_frames_that_gave_nothing_by_reason(path, poses, photographed, capsys):
     save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
     lines = photographed[0].read_text().splitlines()
