@@ -181,6 +181,14 @@ def test_errors_in_the_words_of_ros_have_a_remedy(arguments, remedy):
         run.initialise(['--ros-args', *arguments], Context())
 
 
+def test_a_namespace_that_ends_with_a_slash_ends_a_node_for_good():
+    """With a traceback and status 1 launch would have started it again every second."""
+    program = 'import sys; from thermal_fiducial.nodes import pose_ekf; sys.exit(pose_ekf.main())'
+    done = finished(program, '--ros-args', '-r', '__ns:=/drone/')
+    assert (done.returncode, 'Traceback' in done.stderr) == (2, False)
+    assert 'a namespace is as /drone1, without a slash at its end' in done.stderr
+
+
 def without_a_home(program, *arguments):
     """What a program says and its exit status where ROS cannot write its logs."""
     home = {name: value for name, value in environment().items() if name != 'ROS_LOG_DIR'} | {'ROS_HOME': '/proc/here'}

@@ -64,7 +64,8 @@ _HINTS = {
     'Sequence should be of same type': ': among decimal numbers write 0.0 for 0',
     '__ns:=': ': a namespace begins with a slash, as /drone1',
 }
-
+#: Of rcl's error for a node whose name or namespace is none.
+_NO_NAME = 'invalid node name'
 
 #: Arguments of what runs for a command and not on a robot: no files in ~/.ros/log, which may not be writable.
 OF_A_COMMAND = ('--ros-args', '--disable-external-lib-logs')
@@ -199,12 +200,14 @@ def _close(node: StageNode[Any], crashed: type[BaseException] | None, *_: object
 
 
 def _made(make_node: Callable[[], StageNode[Any]]) -> StageNode[Any]:
-    """The node; InputError if SROS2 denies it, so that it is not restarted."""
+    """The node; InputError if SROS2 denies it, or its name is none, so that it is not restarted."""
     try:
         return make_node()
     except RuntimeError as error:
         if _is_secured() and ok():
             raise InputError(f'ROS_SECURITY_ENABLE is true: {_first_line(error)}') from None
+        if _NO_NAME in str(error):
+            raise InputError(f'{_first_line(error)}: a namespace is as /drone1, without a slash at its end') from None
         raise
 
 
