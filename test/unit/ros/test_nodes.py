@@ -11,6 +11,7 @@ from nav_msgs.msg import Odometry, Path
 import numpy as np
 import pytest
 from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.context import Context
 from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
@@ -33,6 +34,7 @@ from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
 from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.counting import CountingNode
 from thermal_fiducial.ros.base.node import ERROR, OK, WARN
 from thermal_fiducial.ros.mapper_node.map_refinement import MapRefinement
 from thermal_fiducial.ros.messages import clouds, convert, message_bytes
@@ -205,6 +207,26 @@ def test_markers_come_as_rows_of_the_contract(graph):
     # Flat pictures at 2.4 m: a few centimetres.
     np.testing.assert_allclose(rows['z'], 2.4, atol=0.1)
     assert (none.width, len(none.data)) == (0, 0)
+
+
+def test_an_input_of_another_type_is_named(graph, capfd):
+    """Of compressed images on the topic of images DDS says nothing: it was waited for them."""
+    node = graph.add(Tau2Camera, live=True)
+    said = 'thermal/image_raw is of sensor_msgs/msg/CompressedImage, and not sensor_msgs/msg/Image'
+    # A participant has one type on a topic.
+    context = Context()
+    context.init()
+    driver = CountingNode('driver', context=context)
+    try:
+        output = driver.advertise(CompressedImage, 'thermal/image_raw')
+        graph.spin_until(lambda: node.get_publishers_info_by_topic(output.topic))
+        assert graph.diagnose(node)[:2] == (WARN, said)
+        assert said in capfd.readouterr().err
+    finally:
+        driver.destroy_node()
+        context.try_shutdown()
+    graph.send('thermal/image_raw', *frames(1))
+    assert graph.diagnose(node)[1] != said
 
 
 def test_a_missing_camera_info_is_reported_until_it_comes(graph):

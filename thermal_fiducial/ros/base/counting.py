@@ -173,6 +173,13 @@ class CountingNode(Node):
         self.lazy[subscription] = source
         return source
 
+    def other_type(self, source: Input) -> str:
+        """That the topic of an input has messages of another type, which DDS keeps from it without a word; or empty."""
+        kind = source.subscription.msg_type
+        own = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+        types = {publisher.topic_type for publisher in self.get_publishers_info_by_topic(source.topic)}
+        return f'{source.topic.lstrip("/")} is of {min(types - {own})}, and not {own}' if types - {own} else ''
+
     @property
     def subscriptions(self) -> Iterator[Any]:
         """Subscriptions that the executor serves."""

@@ -97,6 +97,8 @@ class StageNode(CountingNode, Generic[Config]):
         self.deaf = ''
         # Diagnostics in a row for which there has been a second node of this name, or publisher of the main input.
         self._twin_for = self._shared_for = 0
+        # That the missing main input has another type.
+        self._other_type = ''
         #: console lines for a pilot
         self.console = Console(self.get_logger())
         #: warnings of the configuration, besides parameters that others keep from having an effect
@@ -226,8 +228,10 @@ class StageNode(CountingNode, Generic[Config]):
         if self.live and not self.deaf:
             self._listen()
             self._look_for_doubles()
+            self._other_type = self.other_type(self.inputs[0]) if self._rates.silent else ''
         level, reason = self._level()
-        self.console.say(self._twin or self._rates.trouble() or self.headline(), calm=level == OK)
+        trouble = self._twin or self._other_type or self._rates.trouble()
+        self.console.say(trouble or self.headline(), calm=level == OK)
         counts: dict[str, object] = {f'received {source.topic}': source.count for source in self.inputs}
         counts |= {f'left {source.topic}': source.left for source in self.inputs if source.left}
         counts |= {
@@ -274,7 +278,7 @@ class StageNode(CountingNode, Generic[Config]):
         if self.refused > self._diagnosed_refused:
             return WARN, self.last_refusal
         if self._rates.silent:
-            return ERROR if self._rates.stopped else WARN, f'nothing on {self._rates.main}'
+            return ERROR if self._rates.stopped else WARN, self._other_type or f'nothing on {self._rates.main}'
         level, reason = self.state()
         shared = f'two publishers on {self._rates.main}' if self._shared_for >= _TWIN_AFTER else ''
         doubts = [*filter(None, [shared, self._rates.doubt()]), *without_effect(self.config), *self.remarks]
