@@ -181,12 +181,19 @@ def test_errors_in_the_words_of_ros_have_a_remedy(arguments, remedy):
         run.initialise(['--ros-args', *arguments], Context())
 
 
-def test_a_namespace_that_ends_with_a_slash_ends_a_node_for_good():
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (('-r', '__ns:=/drone/'), 'a namespace is as /drone1, without a slash at its end'),
+        (('-p', 'use_sim_time:="true"'), "'use_sim_time' to 'true' of type 'STRING', expecting type 'BOOL'"),
+    ],
+)
+def test_what_rclpy_refuses_of_a_node_ends_it_for_good(arguments, words):
     """With a traceback and status 1 launch would have started it again every second."""
     program = 'import sys; from thermal_fiducial.nodes import pose_ekf; sys.exit(pose_ekf.main())'
-    done = finished(program, '--ros-args', '-r', '__ns:=/drone/')
+    done = finished(program, '--ros-args', *arguments)
     assert (done.returncode, 'Traceback' in done.stderr) == (2, False)
-    assert 'a namespace is as /drone1, without a slash at its end' in done.stderr
+    assert words in done.stderr
 
 
 def without_a_home(program, *arguments):

@@ -10,6 +10,7 @@ from typing import Any
 
 import rclpy
 from rclpy.context import Context
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.signals import SignalHandlerOptions
@@ -200,9 +201,12 @@ def _close(node: StageNode[Any], crashed: type[BaseException] | None, *_: object
 
 
 def _made(make_node: Callable[[], StageNode[Any]]) -> StageNode[Any]:
-    """The node; InputError if SROS2 denies it, or its name is none, so that it is not restarted."""
+    """The node; InputError if SROS2 denies it, or rclpy its name or parameters, so that it is not restarted."""
     try:
         return make_node()
+    except ParameterException as error:
+        # Of use_sim_time, which rclpy declares before ours.
+        raise InputError(str(error)) from None
     except RuntimeError as error:
         if _is_secured() and ok():
             raise InputError(f'ROS_SECURITY_ENABLE is true: {_first_line(error)}') from None
