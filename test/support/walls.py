@@ -18,8 +18,8 @@ NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 FRAME_NS = 33_333_333
 #: Standard deviations of the velocity [m/s] and of the turn rate [rad/s] of a filter.
 TWIST_STD = 0.03, 0.01
-# Noise of corners that are read row by row [px].
-_SIGMA = 0.05
+#: Noise of corners that are read row by row [px].
+NOISE_PX = 0.05
 # A marker that hangs on the wall x = 0 and faces -x: its x to map -y, its y to map z.
 _FACING = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
@@ -93,7 +93,7 @@ def read_row_by_row(path, t, poses, readout, rng, lens=None):
     if lens is not None:
         px = px + LensErrors(px, CAMERA, SystematicErrors()).drawn()[..., lens]
     seen = CAMERA.contains(px, 5.0).all(axis=-1)
-    return rows(ids[seen], px[seen] + _SIGMA * rng.normal(size=px[seen].shape), _SIGMA)
+    return rows(ids[seen], px[seen] + NOISE_PX * rng.normal(size=px[seen].shape), NOISE_PX)
 
 
 def stamp(k):

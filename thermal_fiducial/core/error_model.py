@@ -70,9 +70,9 @@ CORRELATED_POSES = 30.0
 #: What a calibration leaves of the readout time of a rolling shutter [s]: 0.1 to 0.3 ms where rows are read in 16 ms.
 #: Enters the decision to name it as not declared.
 READOUT_AS_DECLARED = 5e-4
-#: Share of an undeclared readout time that corners do not show, as the detector fits squares to what it has sheared: up
-#: to a tenth on rendered frames. Enters the error of that time, and with it poses.
-HIDDEN_OF_READOUT = 0.1
+#: Departure of a marker's outline from a square, by the cut of markers and by lens calibrations [share of a side].
+#: Enters the detector's constraint that it is one, and so what corners show of rows that are read late.
+SQUARE_STD = 0.003
 #: Part of the re-projection error, by bent plates and corner bias, that is no sign of an inconsistent marker [px].
 INCONSISTENT_PX = 0.3
 #: Largest noise of corners by pixels [px]: markers of twice the noise of a pixel claim 0.35. What a marker claims

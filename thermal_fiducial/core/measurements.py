@@ -155,6 +155,9 @@ class Observations(Stacked):
     detector_px: FloatArray
     #: (N, 2, 4, 4) T_camera_marker and its alternative, NaN where there is none
     branches: FloatArray
+    #: (N, 4, 2, 6) derivative by a displacement of the camera from the first row to the last [m, rad], in map axes;
+    #: zero where no motion is known
+    by_rows: FloatArray
 
     @staticmethod
     def of(markers: Markers) -> 'Observations':
@@ -174,7 +177,10 @@ class Observations(Stacked):
         poses = numbers[:, -len(_BRANCHES) :].reshape(-1, 2, 7)
         with np.errstate(invalid='ignore', divide='ignore'):
             branches = transform_from_quaternion(poses[..., :3], poses[..., 3:])
-        observations = Observations(markers['id'].astype(np.int64), corners, covariances, detector_px, branches)
+        by_rows = np.zeros((len(markers), 4, 2, 6))
+        observations = Observations(
+            markers['id'].astype(np.int64), corners, covariances, detector_px, branches, by_rows
+        )
         uu, uv, vv = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
         sound = (uu > 0.0) & (uu * vv > uv**2) & np.isfinite(corners).all(axis=2)
         usable: BoolArray = np.asarray(sound.all(axis=1))

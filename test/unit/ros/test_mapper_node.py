@@ -151,7 +151,7 @@ def test_a_map_in_other_units_is_doubted_though_frames_allow_two_poses_or_none(g
 def test_a_rolling_shutter_that_is_not_as_declared_is_named(graph, map_file):
     node = graph.add(MarkerMapperNode, map_file=str(map_file))
     assert node.headline() == ''
-    node.mapper.readout.adopt(ReadoutEstimate(0.0147, 0.0003))
+    node.mapper.readout.adopt(ReadoutEstimate(0.0147, 0.0015))
     said = 'rows are read over 14.7 +- 1.5 ms more than readout_time says: add 0.0147'
     level, reason = node.state()
     assert (level, node.headline(), said in reason) == (WARN, said, True)

@@ -22,6 +22,9 @@ INLIER = 3.0
 _LINEAR = 0.1
 # Ratio of the squared errors of a marker's two poses beyond which the image rules out the worse one.
 _AMBIGUOUS = 10.0
+# Step of the differences for the derivatives of outlines [px]: a millionth of a side, far above rounding.
+_STEP_PX = 1e-4
+_OF_EACH = np.eye(4)[:, None, :, None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,3 +239,26 @@ def _axis_to(v: FloatArray) -> FloatArray:
     R[:, :2, :2] = np.eye(2) - d[:, :, None] * (d / (1.0 + z))[:, None, :]
     R[:, :2, 2], R[:, 2, :2], R[:, 2, 2] = d, -d, z[:, 0]
     return R
+
+
+def squareness(x: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The two constraints of N outlines, 0 for squares, and their derivatives by the corners.
+
+    Parameters
+    ----------
+    x, inverse : (N, 4, 2) normalised corners, and (N, 4, 2, 2) their derivatives by pixels
+
+    Returns
+    -------
+    (N, 2, 1) cosine of the angle, and difference of the sides over their length; (N, 2, 8) [1/px]
+    """
+    # The outlines themselves, and with each coordinate of each corner displaced.
+    steps = _STEP_PX * inverse.swapaxes(2, 3)[:, :, :, None] * _OF_EACH
+    outlines = np.concatenate([x[:, None], x[:, None] + steps.reshape(-1, 8, 4, 2)], axis=1).reshape(-1, 4, 2)
+    weight = perspective(outlines)[..., None]
+    corners = np.concatenate([weight * outlines, weight], axis=-1)
+    sides = corners[:, 1::2] - corners[:, :1]
+    products = sides @ sides.swapaxes(1, 2)
+    both, first, second = products[:, 0, 1], products[:, 0, 0], products[:, 1, 1]
+    value = (np.array([2.0 * both, first - second]) / (first + second)).reshape(2, -1, 9).swapaxes(0, 1)
+    return value[..., :1], (value[..., 1:] - value[..., :1]) / _STEP_PX

@@ -248,7 +248,7 @@ class KeyframeStore:
         if predicted is None:
             return frame
         information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
-        rates = _sure(*rates_of_rows(observed, camera, predicted))
+        rates = _sure(*rates_of_rows(observed, predicted))
         return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information, rates=rates)
 
     def _carry_over(self, before: Camera, now: Camera) -> None:

@@ -125,8 +125,8 @@ class MarkerMapper:
     def locate(self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None) -> LocatedFrame:
         """First half of :meth:`process`, up to the pose, which can be published before the map is updated."""
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
-        raw, errors = Observations.of(markers), self._errors_of(camera)
-        observed = self.readout.corrected(raw, camera, predicted)
+        raw, errors = self.readout.read_by_rows(Observations.of(markers), camera, predicted), self._errors_of(camera)
+        observed = self.readout.corrected(raw, predicted)
         observed = replace(observed, corners=without_found_aspect(observed.corners, camera, errors))
         # Step 2: known and new markers.
         is_known, known = self._in_map(observed)
@@ -138,7 +138,7 @@ class MarkerMapper:
             fit = partial(locate, stamp_ns, camera=camera, model=errors, odometry=odometry, last=last)
             outcome = from_consistent_markers(sight, camera, predicted, fit)
             if isinstance(outcome, Location):
-                outcome = self.readout.claimed(outcome, camera, predicted)
+                outcome = self.readout.claimed(outcome, predicted)
         elif len(known.sizes):
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
@@ -204,7 +204,7 @@ class MarkerMapper:
             self._consistency.weigh_map(frame)
         if isinstance(outcome, Location):
             # Also where its pose contradicts the odometry: in fast motion this may be why.
-            self.readout.add(outcome, frame.camera, frame.predicted)
+            self.readout.add(outcome, frame.predicted)
         return MapperResult(
             frame.stamp_ns, frame.pose, frame.reason, changed, frozenset(frame.known.observed.ids.tolist()), waiting,
             dict(self._consistency.quarantined), not self.frozen and (changed or updated),

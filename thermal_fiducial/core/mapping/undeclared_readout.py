@@ -15,13 +15,13 @@ from thermal_fiducial.core.error_model import (
     covariance_of_one_error,
     drawn_sum,
     DRAWS,
-    HIDDEN_OF_READOUT,
     noise_factor,
     READOUT_AS_DECLARED,
+    SQUARE_STD,
 )
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.planar_pose import INLIER
-from thermal_fiducial.core.geometry.reprojection import interaction, turn_of_pose, turned, whitening
+from thermal_fiducial.core.geometry.planar_pose import INLIER, squareness
+from thermal_fiducial.core.geometry.reprojection import interaction, turn_of_pose, whitening
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.motion_prior import PredictedCamera
@@ -38,11 +38,6 @@ class ReadoutEstimate:
     #: the time and its standard deviation [s]
     seconds: float
     std: float
-
-    @property
-    def claim(self) -> float:
-        """The standard deviation with what a detector hides of the time [s]."""
-        return math.hypot(self.std, HIDDEN_OF_READOUT * self.seconds)
 
     @property
     def sigmas(self) -> float:
@@ -63,38 +58,54 @@ class UndeclaredReadout:
         self._common: FloatArray = np.zeros(DRAWS)
         self._is_by_map = False
 
-    def corrected(self, observed: Observations, camera: Camera, predicted: PredictedCamera | None) -> Observations:
+    def read_by_rows(self, observed: Observations, camera: Camera, predicted: PredictedCamera | None) -> Observations:
+        """N markers with what displaces their corners where rows are read late, as the detector has them.
+
+        Such rows bend the outline of a marker, and the detector pulls it towards a square as far as the noise of the
+        corners allows (``as_squares``).
+        """
+        if predicted is None or self._prior_std == 0.0 or len(observed.ids) == 0:
+            return observed
+        at, R = ImagePoints.at(observed.corners, camera), predicted.pose.T_map_camera[:3, :3]
+        J_camera = at.J @ interaction(at.x, _depths(at.x, observed.branches[:, 0])) @ turn_of_pose(R.T)
+        displaced = camera.readout_shares(observed.corners[..., 1])[..., None, None] * J_camera
+        J = squareness(at.x, at.inverse)[1].reshape(-1, 2, 4, 2).swapaxes(1, 2)
+        spread = observed.covariances @ J.swapaxes(-1, -2)
+        information = np.linalg.inv((J @ spread).sum(axis=1) + SQUARE_STD**2 * np.eye(2))
+        pulled = information @ (J @ displaced).sum(axis=1)
+        return replace(observed, by_rows=displaced - spread @ pulled[:, None])
+
+    def corrected(self, observed: Observations, predicted: PredictedCamera | None) -> Observations:
         """The corners of N markers at the stamp, without what the time displaces them by in a camera in motion."""
         seconds = self.estimate.seconds
         if predicted is None or seconds == 0.0:
             return observed
-        rates, unsure = rates_of_rows(observed, camera, predicted)
+        rates, unsure = rates_of_rows(observed, predicted)
         return replace(
             observed, corners=observed.corners - seconds * rates, covariances=observed.covariances + seconds**2 * unsure
         )
 
-    def claimed(self, location: Location, camera: Camera, predicted: PredictedCamera | None) -> Location:
+    def claimed(self, location: Location, predicted: PredictedCamera | None) -> Location:
         """The location, whose covariance has what is not known of the time."""
-        if predicted is None or self.estimate.claim == 0.0:
+        if predicted is None or self.estimate.std == 0.0:
             return location
-        shares = camera.readout_shares(location.sight.observed.corners[..., 1])
-        rates = shares.reshape(-1, 1) * (location.reprojection.J_camera @ predicted.velocity).reshape(-1, 2)
+        rates = (location.sight.observed.by_rows @ predicted.velocity).reshape(-1, 2)
         moved = np.einsum('nij,nj->i', location.corner_gains, rates)
-        return replace(location, pose=location.pose.widened(covariance_of_one_error(moved, self.estimate.claim)))
+        return replace(location, pose=location.pose.widened(covariance_of_one_error(moved, self.estimate.std)))
 
-    def add(self, location: Location, camera: Camera, predicted: PredictedCamera | None) -> None:
+    def add(self, location: Location, predicted: PredictedCamera | None) -> None:
         """Update with the residuals of a frame that was corrected by the time as known so far."""
-        if predicted is None or self._is_by_map:
+        if predicted is None or self._prior_std == 0.0 or self._is_by_map:
             return
         sight, fit = location.sight, location.reprojection
-        W, shares = whitening(sight.observed.covariances), camera.readout_shares(sight.observed.corners[..., 1])
+        W = whitening(sight.observed.covariances)
         residuals = (W @ fit.residuals[..., None])[..., 0]
         squared = (residuals * residuals).sum(axis=-1)
         roots = np.sqrt(location.weights[:, None] / np.maximum(squared / INLIER**2, 1.0))[..., None]
-        J = roots[..., None] * W @ fit.J_camera.reshape(*squared.shape, 2, 6)
-        Q = np.linalg.qr(J.reshape(-1, 6))[0]
+        W_robust = roots[..., None] * W
+        Q = np.linalg.qr((W_robust @ fit.J_camera.reshape(*squared.shape, 2, 6)).reshape(-1, 6))[0]
         # Derivatives (8 N, 6) by a displacement in the time that the pose does not take up.
-        left = _without(Q, (shares[..., None, None] * J).reshape(-1, 6))
+        left = _without(Q, (W_robust @ sight.observed.by_rows).reshape(-1, 6))
         by_time, rest = left @ predicted.velocity, _without(Q, (roots * residuals).ravel())
         information, shown = float(by_time @ by_time), float(by_time @ rest)
         unsure = float(np.sum(left @ predicted.velocity_covariance(1.0) * left))
@@ -132,19 +143,23 @@ class UndeclaredReadout:
         seconds = self.estimate.seconds
         if self.estimate.sigmas < _CONTRADICTS:
             return ''
-        off, std = 1e3 * abs(seconds), 1e3 * self.estimate.claim
+        off, std = 1e3 * abs(seconds), 1e3 * self.estimate.std
         more, add = ('more', 'add') if seconds > 0.0 else ('less', 'subtract')
         return f'rows are read over {off:.1f} +- {std:.1f} ms {more} than readout_time says: {add} {1e-3 * off:.4f}'
 
 
-def rates_of_rows(observed: Observations, camera: Camera, predicted: PredictedCamera) -> tuple[FloatArray, FloatArray]:
+def rates_of_rows(observed: Observations, predicted: PredictedCamera) -> tuple[FloatArray, FloatArray]:
     """Displacement (N, 4, 2) of the corners of N markers by each second of the time [px/s], and its covariances."""
-    at, R = ImagePoints.at(observed.corners, camera), predicted.pose.T_map_camera[:3, :3]
-    depth = np.repeat(observed.branches[:, :1, 2, 3], 4, axis=1)
-    shares = camera.readout_shares(observed.corners[..., 1])[..., None, None]
-    by_twist = shares * (at.J @ interaction(at.x, depth))
-    moved = by_twist @ (turn_of_pose(R.T) @ predicted.velocity)
-    return moved, by_twist @ turned(predicted.velocity_covariance(1.0), R.T) @ by_twist.swapaxes(-1, -2)
+    by_rows = observed.by_rows
+    return by_rows @ predicted.velocity, by_rows @ predicted.velocity_covariance(1.0) @ by_rows.swapaxes(-1, -2)
+
+
+def _depths(x: FloatArray, T_camera_marker: FloatArray) -> FloatArray:
+    """Depths (N, 4) of normalised points (N, 4, 2) in the planes of markers (N, 4, 4); infinite without a pose."""
+    normal, centre = T_camera_marker[:, None, :3, 2], T_camera_marker[:, None, :3, 3]
+    along_rays = np.sum(x * normal[..., :2], axis=-1) + normal[..., 2]
+    depths = np.sum(normal * centre, axis=-1) / along_rays
+    return np.where(np.isfinite(depths), depths, np.inf)
 
 
 def _without(Q: FloatArray, errors: FloatArray) -> FloatArray:

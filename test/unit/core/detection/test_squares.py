@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corners.squares import as_squares, squareness
+from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
+from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses, squareness
 from thermal_fiducial.core.geometry.reprojection import marker_corners
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])

@@ -75,7 +75,12 @@ def test_a_marker_enters_where_it_is_though_the_calibration_changes_meanwhile(ch
         camera = CAMERA if k < 3 else other
         own = seen_from(x, NO_DRAWS, camera)
         shown = Observations(
-            np.array([7]), own.corners[None], own.corner_covariances[None], np.zeros(1), own.branches[None]
+            np.array([7]),
+            own.corners[None],
+            own.corner_covariances[None],
+            np.zeros(1),
+            own.branches[None],
+            np.zeros((1, 4, 2, 6)),
         )
         placed += new.show(own.stamp_ns, shown, camera, own.viewpoint, errors)[0]
     (marker,) = placed

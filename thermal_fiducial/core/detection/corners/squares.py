@@ -10,14 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import SQUARE_STD
 from thermal_fiducial.core.geometry.camera import ImagePoints, inverse_2x2
-from thermal_fiducial.core.geometry.planar_pose import ippe_square
-from thermal_fiducial.core.geometry.reprojection import marker_corners, perspective
+from thermal_fiducial.core.geometry.planar_pose import ippe_square, squareness
+from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.geometry.se3 import apply
 from thermal_fiducial.core.types import FloatArray
 
-# Standard deviation of the two constraints, by the cut of markers and by lens calibrations.
-_SQUARE_STD = 0.003
 # Linearisation error of the constraints as a share of their values.
 _BENT = 0.1
 # The constraints are nonlinear: largest number of linearisations, and the step below which they are not repeated [px].
@@ -25,9 +24,7 @@ _STEPS, _BENDS_PX = 3, 0.05
 # Squared Mahalanobis distance (2 d.o.f.) beyond which an outline is inconsistent with a square: a square of the second
 # planar pose is tried then. One true square in 400 is as far off.
 _INCONSISTENT = 12.0
-# Step of the differences from which the derivatives are taken [px]: a millionth of a side, far above rounding.
-_STEP_PX = 1e-4
-_EYE, _OF_EACH = np.eye(2), np.eye(4)[:, None, :, None]
+_EYE = np.eye(2)
 # Mean displacement of all corners, for each of them.
 _TOGETHER = np.kron(np.ones((4, 4)) / 4, _EYE)
 
@@ -96,7 +93,7 @@ def _corrected(at: ImagePoints, moved: FloatArray, measured: FloatArray, covaria
         value, J = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
         error = value + J @ (measured - moved)
         spread = covariance @ J.swapaxes(1, 2)
-        variance = _SQUARE_STD**2 + (_BENT * value) ** 2
+        variance = SQUARE_STD**2 + (_BENT * value) ** 2
         information = inverse_2x2(J @ spread + variance * _EYE)
         weighted = information @ error
         before, moved = moved, measured - spread @ weighted
@@ -107,26 +104,3 @@ def _corrected(at: ImagePoints, moved: FloatArray, measured: FloatArray, covaria
     constrained = 2.0 - np.einsum('nij,nii->n', variance, information)
     doubt = np.where(chi2 > _INCONSISTENT, np.einsum('nij,nij->n', left, left), 0.0)
     return Squared(moved, covariance - spread @ information @ spread.swapaxes(1, 2), chi2, doubt, constrained)
-
-
-def squareness(x: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The two constraints of N outlines, 0 for squares, and their derivatives by the corners.
-
-    Parameters
-    ----------
-    x, inverse : (N, 4, 2) normalised corners, and (N, 4, 2, 2) their derivatives by pixels
-
-    Returns
-    -------
-    (N, 2, 1) cosine of the angle, and difference of the sides over their length; (N, 2, 8) [1/px]
-    """
-    # The outlines themselves, and with each coordinate of each corner displaced.
-    steps = _STEP_PX * inverse.swapaxes(2, 3)[:, :, :, None] * _OF_EACH
-    outlines = np.concatenate([x[:, None], x[:, None] + steps.reshape(-1, 8, 4, 2)], axis=1).reshape(-1, 4, 2)
-    weight = perspective(outlines)[..., None]
-    corners = np.concatenate([weight * outlines, weight], axis=-1)
-    sides = corners[:, 1::2] - corners[:, :1]
-    products = sides @ sides.swapaxes(1, 2)
-    both, first, second = products[:, 0, 1], products[:, 0, 0], products[:, 1, 1]
-    value = (np.array([2.0 * both, first - second]) / (first + second)).reshape(2, -1, 9).swapaxes(0, 1)
-    return value[..., :1], (value[..., 1:] - value[..., :1]) / _STEP_PX
