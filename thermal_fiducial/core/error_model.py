@@ -261,9 +261,14 @@ def survey_for_weights(of_survey: FloatArray, noise: FloatArray, errors: Systema
     return np.asarray((noise**2 / (noise**2 + errors.corner_px**2))[:, None, None] * of_survey)
 
 
-def decision_weights(noise: FloatArray) -> FloatArray:
-    """Factors (N,) on weights of markers with corner ``noise`` (N,) [px] that add the bias for decisions."""
-    return np.asarray(noise**2 / (noise**2 + DECISION_PX**2))
+def decision_weights(noise: FloatArray, by_readout: FloatArray) -> FloatArray:
+    """Factors (N,) on weights of markers that add the bias for decisions, and what is not known of the readout time.
+
+    Parameters
+    ----------
+    noise, by_readout : (N,) standard deviations of the corners [px]
+    """
+    return np.asarray(noise**2 / (noise**2 + DECISION_PX**2 + by_readout**2))
 
 
 def with_corner_errors(covariances: FloatArray) -> FloatArray:

@@ -158,6 +158,8 @@ class Observations(Stacked):
     #: (N, 4, 2, 6) derivative by a displacement of the camera from the first row to the last [m, rad], in map axes;
     #: zero where no motion is known
     by_rows: FloatArray
+    #: (N,) standard deviation of a coordinate by what is not known of the readout time [px]
+    readout_px: FloatArray
 
     @staticmethod
     def of(markers: Markers) -> 'Observations':
@@ -179,7 +181,7 @@ class Observations(Stacked):
             branches = transform_from_quaternion(poses[..., :3], poses[..., 3:])
         by_rows = np.zeros((len(markers), 4, 2, 6))
         observations = Observations(
-            markers['id'].astype(np.int64), corners, covariances, detector_px, branches, by_rows
+            markers['id'].astype(np.int64), corners, covariances, detector_px, branches, by_rows, np.zeros(len(markers))
         )
         uu, uv, vv = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
         sound = (uu > 0.0) & (uu * vv > uv**2) & np.isfinite(corners).all(axis=2)

@@ -145,7 +145,9 @@ class JointFit:
 
     def decisive_weights(self, found: Location) -> FloatArray:
         """Weights (N,) of the markers against odometry: with the bias of corners, and residuals above their claims."""
-        relative = found.weights / found.weights.max() * decision_weights(self.sight.noise_px)
+        relative = (
+            found.weights / found.weights.max() * decision_weights(self.sight.noise_px, self.sight.observed.readout_px)
+        )
         _, chi2 = self._weighted(found.reprojection, relative)
         return np.asarray(relative / noise_factor(chi2, 8 * len(relative) - 6))
 
@@ -218,7 +220,10 @@ class JointFit:
         apart = (turn_between(T, hypotheses) > SAME_POSE) & self._shown_from(hypotheses)
         if not np.any(apart):
             return None
-        starts, weights = hypotheses[apart], found.weights * decision_weights(self.sight.noise_px)
+        starts, weights = (
+            hypotheses[apart],
+            found.weights * decision_weights(self.sight.noise_px, self.sight.observed.readout_px),
+        )
         (T, other), chi2, _ = self.fit.solve(np.stack([T, starts[0]]), weights, inlier=np.inf)
         scale = noise_factor(float(chi2[0]), 8 * len(weights) - 6)
         if turn_between(T, other) > SAME_POSE and self._shown_from(other):

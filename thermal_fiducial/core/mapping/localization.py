@@ -139,7 +139,7 @@ def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPo
         if abs(excess) > DECISIVE:
             return found if excess > 0.0 else second
     chi2 = frame.fit.costs(np.stack([found.pose.T_map_camera, second.pose.T_map_camera]))
-    chi2 *= decision_weights(frame.sight.noise_px).min()
+    chi2 *= decision_weights(frame.sight.noise_px, frame.sight.observed.readout_px).min()
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
     likelier, less_likely = (found, second) if chi2[0] <= chi2[1] else (second, found)
     pose = _mean(likelier, less_likely)

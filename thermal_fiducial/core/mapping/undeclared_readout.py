@@ -77,12 +77,14 @@ class UndeclaredReadout:
 
     def corrected(self, observed: Observations, predicted: PredictedCamera | None) -> Observations:
         """The corners of N markers at the stamp, without what the time displaces them by in a camera in motion."""
-        seconds = self.estimate.seconds
-        if predicted is None or seconds == 0.0:
+        if predicted is None or self._prior_std == 0.0:
             return observed
-        rates, unsure = rates_of_rows(observed, predicted)
+        seconds, (rates, unsure) = self.estimate.seconds, rates_of_rows(observed, predicted)
         return replace(
-            observed, corners=observed.corners - seconds * rates, covariances=observed.covariances + seconds**2 * unsure
+            observed,
+            corners=observed.corners - seconds * rates,
+            covariances=observed.covariances + seconds**2 * unsure,
+            readout_px=self.estimate.std * np.sqrt(np.mean(rates**2, axis=(1, 2))),
         )
 
     def claimed(self, location: Location, predicted: PredictedCamera | None) -> Location:

@@ -81,6 +81,7 @@ def test_a_marker_enters_where_it_is_though_the_calibration_changes_meanwhile(ch
             np.zeros(1),
             own.branches[None],
             np.zeros((1, 4, 2, 6)),
+            np.zeros(1),
         )
         placed += new.show(own.stamp_ns, shown, camera, own.viewpoint, errors)[0]
     (marker,) = placed
