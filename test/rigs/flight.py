@@ -18,6 +18,7 @@ from rigs.room import Room
 from rigs.score import Score, Worth
 from thermal_fiducial import Camera, ImuSample, load_dictionary, MarkerMap, Odometry, Pipeline
 from thermal_fiducial.core.detection.patterns import Dictionary
+from thermal_fiducial.core.error_model import READOUT_AS_DECLARED
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.pipeline import PipelineConfig
 
@@ -116,7 +117,7 @@ def _camera(rig: Rig) -> Camera:
 
 
 def _config(rig: Rig, mode: str, declared: Mapping[str, float]) -> PipelineConfig:
-    """Defaults but for what a rig is, and for what is ``declared`` of its errors."""
+    """Defaults but for what a rig is, as calibrated, and for what is ``declared`` of its errors."""
     T = rig.T_calibrated
     return PipelineConfig.from_mapping(
         {
@@ -125,6 +126,8 @@ def _config(rig: Rig, mode: str, declared: Mapping[str, float]) -> PipelineConfi
             'marker_size': rig.task.size,
             'camera_position': T[:3, 3].tolist(),
             'camera_orientation': Rotation.from_matrix(T[:3, :3]).as_quat().tolist(),
+            # A global shutter, as the calibration that has found the camera's place shows.
+            'readout_time_std': READOUT_AS_DECLARED,
             'imu.gyroscope_noise_density': float(rig.imu.density[0]),
             'imu.accelerometer_noise_density': float(rig.imu.density[3]),
         }

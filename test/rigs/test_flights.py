@@ -14,8 +14,9 @@ SHORT = (8, 3.5, (2.6, 4.6))
 NIGHTLY = (
     # Linear, looking away.
     (92, SECONDS, (9.5, 13.3)),
-    # Plateau, looking away behind smoke, with a shutter event.
-    (111, SECONDS, (16.7, 17.9)),
+    # Plateau, looking away behind smoke, with a shutter event. 16.7 and 24.8 where maps are taken for level to 0.3 deg,
+    # as this one is.
+    (111, SECONDS, (20.2, 31.5)),
     # Raw, landing behind smoke, with a shutter event.
     (106, SECONDS, (5.4, 5.7)),
     # Linear, turning behind smoke, with a shutter event.
