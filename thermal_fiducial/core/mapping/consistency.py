@@ -166,7 +166,7 @@ class Consistency:
         """Note which markers of a frame agree with the map. A frame with two possible poses says nothing of it."""
         known, outcome = frame.known, frame.outcome
         if isinstance(outcome, Location):
-            errors, error_stds = frame.known_errors(outcome)
+            errors, error_stds = frame.known_errors
             self.of_map.add(known, errors <= np.minimum(DISAGREEMENT * error_stds, most_px(known)))
         elif outcome.compared and outcome.pose is None:
             self.of_map.add(known, np.zeros(len(known.sizes), dtype=np.bool_))

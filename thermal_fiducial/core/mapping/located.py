@@ -244,12 +244,16 @@ class LocatedFrame:
             return False
         return squared_distance(self.outcome.pose, self.predicted.pose) > CONTRADICTION
 
-    def known_errors(self, location: Location) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def known_errors(self) -> tuple[FloatArray, FloatArray]:
         """Rms errors (K,) [px] of the K known markers, and their standard deviations (K,) by noise, pose and map.
 
-        That of a marker behind the camera is the image's width, and so is any larger one.
+        That of a marker behind the camera is the image's width, and so is any larger one. NaN without a location.
         """
-        known, pose = self.known, location.pose
+        known, location = self.known, self.outcome
+        if isinstance(location, Refusal):
+            return np.full(len(known.sizes), np.nan), np.full(len(known.sizes), np.nan)
+        pose = location.pose
         reprojection = (
             location.reprojection if location.sight is known else known.reprojected(self.camera, pose.T_map_camera)
         )

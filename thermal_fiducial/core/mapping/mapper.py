@@ -187,7 +187,7 @@ class MarkerMapper:
             updated = True
             # Step 7: errors updated.
             self._bias.add(outcome)
-            ids, (errors, error_stds) = frame.known.observed.ids.tolist(), frame.known_errors(outcome)
+            ids, (errors, error_stds) = frame.known.observed.ids.tolist(), frame.known_errors
             if self._owns_map:
                 used = outcome.pose.marker_ids
                 changed = self._consistency.judge(self.map.markers, ids, errors, error_stds, used)
