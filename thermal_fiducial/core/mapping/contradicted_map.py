@@ -6,6 +6,7 @@ are: each of them may be what somebody has moved, and of a map in feet a marker 
 
 import numpy as np
 
+from thermal_fiducial.core.geometry.reprojection import sides_px
 from thermal_fiducial.core.mapping.located import Sight
 from thermal_fiducial.core.mapping.map_data import MEMORY
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
@@ -49,9 +50,7 @@ def most_px(sight: Sight) -> FloatArray:
 
     Residuals widen what the pose claims: where none of the markers is in its place all agree with it.
     """
-    corners = sight.observed.corners
-    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
-    return np.asarray(0.5 * sides.mean(axis=-1))
+    return 0.5 * sides_px(sight.observed.corners)
 
 
 def _likely_cause(sight: Sight) -> str:

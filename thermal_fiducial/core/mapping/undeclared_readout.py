@@ -19,7 +19,7 @@ from thermal_fiducial.core.error_model import (
     READOUT_AS_DECLARED,
     SQUARE_STD,
 )
-from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, inverse_2x2
 from thermal_fiducial.core.geometry.planar_pose import INLIER, squareness
 from thermal_fiducial.core.geometry.reprojection import interaction, turn_of_pose, whitening
 from thermal_fiducial.core.mapping.located import Location
@@ -71,7 +71,7 @@ class UndeclaredReadout:
         displaced = camera.readout_shares(observed.corners[..., 1])[..., None, None] * J_camera
         J = squareness(at.x, at.inverse)[1].reshape(-1, 2, 4, 2).swapaxes(1, 2)
         spread = observed.covariances @ J.swapaxes(-1, -2)
-        information = np.linalg.inv((J @ spread).sum(axis=1) + SQUARE_STD**2 * np.eye(2))
+        information = inverse_2x2((J @ spread).sum(axis=1) + SQUARE_STD**2 * np.eye(2))
         pulled = information @ (J @ displaced).sum(axis=1)
         return replace(observed, by_rows=displaced - spread @ pulled[:, None])
 
