@@ -94,14 +94,13 @@ class SelfChecked:
     Raises
     ------
     InputError
-        A value of the wrong type, out of range, or not among the choices; two frames of one name.
+        A value of the wrong type, out of range, or not among the choices.
     """
 
     def __post_init__(self) -> None:
         for item in fields(self):
             if item.default_factory is MISSING:
                 object.__setattr__(self, item.name, checked(item.name, item, getattr(self, item.name)))
-        _refuse_equal_frames(self)
 
 
 def group(kind: type) -> Any:
@@ -197,14 +196,6 @@ def local_path(path: str) -> str:
 def frame_name(name: str) -> str:
     """``name`` without the slash that names of frames begin with in ROS 1; tf2 refuses it in messages."""
     return name.lstrip('/')
-
-
-def _refuse_equal_frames(config: object) -> None:
-    """Raise InputError if two of the frames have one name: a tree of TF has each but once."""
-    names = {name: getattr(config, name, '') for name in _FRAMES}
-    for name, other in combinations(filter(names.get, names), 2):
-        if names[name] == names[other]:
-            raise InputError(f'parameters {name} and {other}: both are {_shown(names[name])}, and must be two frames')
 
 
 def _shown(value: object) -> str:
@@ -364,9 +355,23 @@ class MarkerParameters(SelfChecked):
 
 @dataclass(frozen=True)
 class FrameParameters(SelfChecked):
-    """How the robot's frames are named."""
+    """How the robot's frames are named.
+
+    Raises
+    ------
+    InputError
+        Two frames of one name, besides what :class:`SelfChecked` refuses: a tree of TF has each but once.
+    """
 
     prefix_frames: bool = param(False, "Prefix the robot's frames, but not the map frame, with the node's namespace.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        names = {name: getattr(self, name, '') for name in _FRAMES}
+        for name, other in combinations(filter(names.get, names), 2):
+            if names[name] == names[other]:
+                shown = _shown(names[name])
+                raise InputError(f'parameters {name} and {other}: both are {shown}, and must be two frames')
 
 
 @dataclass(frozen=True)
