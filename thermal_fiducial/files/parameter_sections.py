@@ -82,12 +82,13 @@ def values_of_others(
     for other in (name for name in NODES if name != node):
         theirs = values_for(sections, other, seconds)
         shared = {name for name, _, _ in parameters(NODES[other])} & defaults.keys() & theirs.keys()
-        apart = sorted(name for name in shared if _plain(theirs[name]) != _plain(own[name]))
+        apart = sorted(name for name in shared if as_in_file(theirs[name]) != as_in_file(own[name]))
         if apart:
             yield f'{", ".join(apart)}: {other} has other values than {node}; write them into the section /** for both'
 
 
-def _plain(value: Any) -> Any:
+def as_in_file(value: Any) -> Any:
+    """The value of a parameter as YAML has it."""
     return list(value) if isinstance(value, tuple) else value
 
 

@@ -28,6 +28,7 @@ from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
 from thermal_fiducial.files.marker_map import load_map, other_frame, other_sides
 from thermal_fiducial.files.parameter_sections import (
+    as_in_file,
     joined,
     load_sections,
     mistyped_sections,
@@ -60,7 +61,7 @@ class Settings:
             names = [f'/{self.marker_mapper.second_camera}/{node}' for node in OF_CAMERA]
             configs |= dict(zip(names, self.second, strict=True))
         document = {
-            node: {'ros__parameters': {name: _plain(value) for name, _, value in parameters(config)}}
+            node: {'ros__parameters': {name: as_in_file(value) for name, _, value in parameters(config)}}
             for node, config in configs.items()
         }
         write_text(path, yaml.safe_dump(document, sort_keys=False))
@@ -168,7 +169,3 @@ def _config(node: str, values: dict[str, Any], overrides: Mapping[str, Any]) -> 
 def _values_for_second(node: str, document: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, Any]:
     """Values of a node of the second camera ``name``: those in its namespace, and those for any namespace."""
     return joined(document, node, (section for section in document if {'**', name} & set(section.split('/'))))
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value

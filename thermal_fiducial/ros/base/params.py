@@ -60,9 +60,8 @@ def doubts_of_files(node: str, args: Sequence[str]) -> Iterator[str]:
     """A warning for each of the parameter files in ``args`` that a replay refuses, as it has a parameter twice.
 
     And for each section in them that is meant for ``node``, but ignored by ROS, and for values that another node alone
-    has there. A node that was given another name has
-    none: only who gave it knows how it is spelt. Nor has one of a second camera for sections without a namespace, which
-    are for the first.
+    has there. A node that was given another name has none: only who gave it knows how it is spelt. Nor has one of a
+    second camera for sections without a namespace, which are for the first.
 
     Parameters
     ----------
