@@ -3,10 +3,10 @@
 import argparse
 from pathlib import Path
 
+from thermal_fiducial.cli.arguments import add_remap, warn, whole_number
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import PROCESSES
-from thermal_fiducial.cli.subcommands import add_remap, warn, whole_number
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import parse_remaps

@@ -9,6 +9,7 @@ import numpy as np
 
 from thermal_fiducial.calibration.sources import clean_frames, imu_track, recorded_camera
 from thermal_fiducial.cli import calibrate_intrinsics
+from thermal_fiducial.cli.arguments import add_force, add_remap, file_to_write, refuse_to_overwrite, warn
 from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import LEAST_ORIENTATION_STD, mapped_detector
 from thermal_fiducial.cli.marker_sizes import add_thickness
@@ -16,7 +17,6 @@ from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.cli.ranges import IMU_NOISE
 from thermal_fiducial.cli.recorded_corners import has_corners_only, recorded_rows
-from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite, warn
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.error_model import READOUT_AS_DECLARED

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from thermal_fiducial.calibration.sources import imu_track, imu_track_of_csv
+from thermal_fiducial.cli.arguments import add_force, add_remap, file_to_write, refuse_to_overwrite
 from thermal_fiducial.cli.parser import Parser
-from thermal_fiducial.cli.subcommands import add_force, add_remap, file_to_write, refuse_to_overwrite
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.reading import naming

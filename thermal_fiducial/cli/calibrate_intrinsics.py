@@ -14,6 +14,14 @@ from thermal_fiducial.calibration.lens_choice import CANDIDATES
 from thermal_fiducial.calibration.report import write_refusal, write_report
 from thermal_fiducial.calibration.sources import is_folder_of_pictures
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
+from thermal_fiducial.cli.arguments import (
+    add_force,
+    add_remap,
+    file_to_write,
+    refuse_to_overwrite,
+    warn,
+    whole_number,
+)
 from thermal_fiducial.cli.board_views import (
     BoardViews,
     corners_of,
@@ -34,14 +42,6 @@ from thermal_fiducial.cli.ranges import (
     MOTION_PX,
 )
 from thermal_fiducial.cli.recorded_corners import has_corners_only
-from thermal_fiducial.cli.subcommands import (
-    add_force,
-    add_remap,
-    file_to_write,
-    refuse_to_overwrite,
-    warn,
-    whole_number,
-)
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.mapping.map_data import MarkerMap

@@ -8,11 +8,11 @@ import sys
 import time
 from typing import Any, TYPE_CHECKING
 
+from thermal_fiducial.cli.arguments import warn, whole_number
 from thermal_fiducial.cli.evaluate import make_video, print_tables
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.ranges import FLIGHT_S
-from thermal_fiducial.cli.subcommands import warn, whole_number
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.packages import is_installed, require_plots
 from thermal_fiducial.report.page import evaluate_run, Evaluation, require_packages, write_page

@@ -7,9 +7,9 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
+from thermal_fiducial.cli.arguments import file_to_write, warn
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.subcommands import file_to_write, warn
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.page import evaluate_run, require_packages, VIDEO, write_page
 from thermal_fiducial.report.run_folder import Run

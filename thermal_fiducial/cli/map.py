@@ -9,10 +9,10 @@ import re
 import numpy as np
 
 from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
+from thermal_fiducial.cli.arguments import file_to_write, require_unit, warn
 from thermal_fiducial.cli.marker_sizes import add_sizes, join_sizes
 from thermal_fiducial.cli.parser import add_command, Commands, Parser
 from thermal_fiducial.cli.ranges import COORDINATE_M, MARKER_ID, QUATERNION, SIGMA_DEG, SIGMA_M
-from thermal_fiducial.cli.subcommands import file_to_write, require_unit, warn
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion

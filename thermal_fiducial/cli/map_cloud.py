@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from thermal_fiducial.cli.arguments import file_to_write, require_unit
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.ranges import COORDINATE_M, REACH_M
-from thermal_fiducial.cli.subcommands import file_to_write, require_unit
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.se3 import apply, inverse, quaternion_from_rotation, transform_from_quaternion

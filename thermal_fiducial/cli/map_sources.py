@@ -9,6 +9,7 @@ import re
 
 import numpy as np
 
+from thermal_fiducial.cli.arguments import file_to_write, warn, whole_number
 from thermal_fiducial.cli.map_photos import detect_in_photos, isotropic, photos_in
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import Parser
@@ -19,7 +20,6 @@ from thermal_fiducial.cli.run_parameters import (
     size_std_of_run,
     sizes_of_run,
 )
-from thermal_fiducial.cli.subcommands import file_to_write, warn, whole_number
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera

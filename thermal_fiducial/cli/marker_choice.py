@@ -4,8 +4,8 @@ import argparse
 
 import numpy as np
 
+from thermal_fiducial.cli.arguments import warn
 from thermal_fiducial.cli.parser import Parser
-from thermal_fiducial.cli.subcommands import warn
 from thermal_fiducial.core.detection.patterns import turned_alike
 from thermal_fiducial.core.types import Gray
 from thermal_fiducial.errors import InputError

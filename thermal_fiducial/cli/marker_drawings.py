@@ -8,11 +8,11 @@ from shlex import quote
 
 import numpy as np
 
+from thermal_fiducial.cli.arguments import add_force, refuse_to_overwrite, warn
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import BOARD_POINTS, CELLS, LENGTH_MM
-from thermal_fiducial.cli.subcommands import add_force, refuse_to_overwrite, warn
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray

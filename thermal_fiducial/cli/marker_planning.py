@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
+from thermal_fiducial.cli.arguments import add_force, file_to_write, refuse_to_overwrite, whole_number
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import (
@@ -21,7 +22,6 @@ from thermal_fiducial.cli.ranges import (
     NETD_K,
     TILT_DEG,
 )
-from thermal_fiducial.cli.subcommands import add_force, file_to_write, refuse_to_overwrite, whole_number
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray

@@ -5,11 +5,11 @@ from collections import Counter
 from shlex import quote
 
 from thermal_fiducial.cli import marker_drawings, marker_planning
+from thermal_fiducial.cli.arguments import add_force, file_to_write, refuse_to_overwrite, whole_number
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import BITS, HAMMING, LENGTH_MM
-from thermal_fiducial.cli.subcommands import add_force, file_to_write, refuse_to_overwrite, whole_number
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.core.wording import number_of

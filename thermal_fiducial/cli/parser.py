@@ -7,7 +7,7 @@ from pathlib import Path
 import re
 from typing import Any, NoReturn, TypeAlias
 
-from thermal_fiducial.cli.subcommands import any_path
+from thermal_fiducial.cli.arguments import any_path
 from thermal_fiducial.errors import InputError
 
 PROGRAM = 'thermal-fiducial'

@@ -1,6 +1,6 @@
 """Ranges of numbers on the command line. None holds NaN, infinity, or what no plate, board, camera or room has."""
 
-from thermal_fiducial.cli.subcommands import number, whole_number
+from thermal_fiducial.cli.arguments import number, whole_number
 from thermal_fiducial.config import LARGEST_SIDE, SMALLEST_SIDE
 from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import sys
 import time
 
+from thermal_fiducial.cli.arguments import add_remap, warn
 from thermal_fiducial.cli.evaluate import make_video
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import RATE
-from thermal_fiducial.cli.subcommands import add_remap, warn
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, parse_remaps

@@ -7,11 +7,11 @@ from pathlib import Path
 from shlex import quote
 import textwrap
 
+from thermal_fiducial.cli.arguments import whole_number
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.ranges import CONTRAST_K, FLIGHT_S, FOG_PER_M, FRAME_HZ, LAG_S, OFFSET_S, PROCESSES, READOUT_S
 from thermal_fiducial.cli.simulate_corners import write_corner_flight
-from thermal_fiducial.cli.subcommands import whole_number
 from thermal_fiducial.files.bag_writer import STORAGES
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.render import Quality
