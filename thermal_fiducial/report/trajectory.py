@@ -8,6 +8,7 @@ import numpy as np
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bag_checks import SINGLE_FILES
 from thermal_fiducial.files.bags import BagReader, TRUTH_TOPIC
 from thermal_fiducial.files.trajectory_file import load_tum
 
@@ -72,7 +73,7 @@ def read_truth(path: Path) -> Trajectory:
     """
     if not path.exists():
         raise InputError(f'{path}: no such ground truth (a TUM file or a bag)')
-    if path.is_file() and path.suffix not in ('.mcap', '.db3', '.bag'):
+    if path.is_file() and path.suffix not in SINGLE_FILES:
         return read_tum(path)
     with BagReader(path) as bag:
         bag.require({TRUTH_TOPIC: 'nav_msgs/msg/Odometry'})
