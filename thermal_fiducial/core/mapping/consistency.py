@@ -27,7 +27,7 @@ from thermal_fiducial.core.mapping.located import (
     Sight,
     squared_distance,
 )
-from thermal_fiducial.core.mapping.map_data import MapMarker, MEMORY
+from thermal_fiducial.core.mapping.map_data import MapMarker, NEW_FRAME_SHARE
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.two_poses import DECISIVE
@@ -35,7 +35,8 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
 
 #: Reason of quarantine of markers that the map file already had there.
 FROM_FILE = 'in quarantine since before the map was loaded'
-#: Share of inconsistent frames above which a marker is put in quarantine, and below which it is released.
+#: Share of inconsistent frames above which a marker is put in quarantine, and below which it is released: by
+#: ``NEW_FRAME_SHARE`` the 24th inconsistent frame in a row puts it there, the 45th consistent one releases it.
 QUARANTINE, RELEASE = MOST, 0.1
 #: Ratio of an error to its standard deviation above which a frame counts as inconsistent.
 DISAGREEMENT = 4.0
@@ -201,10 +202,10 @@ class Consistency:
         columns = blamed.tolist(), errors_px.tolist(), ratios.tolist()
         for marker, bad, error, ratio in zip(known, *columns, strict=True):
             share = self._shares.get(marker.id, 0.0)
-            share += MEMORY * (bad - share)
+            share += NEW_FRAME_SHARE * (bad - share)
             self._shares[marker.id] = share
             if marker.trusted and share > QUARANTINE:
-                in_frames = f'in most of the last {1.0 / MEMORY:.0f} frames'
+                in_frames = f'in most of the last {1.0 / NEW_FRAME_SHARE:.0f} frames'
                 self._set_standing(markers, marker.id, f'{error:.1f} px off, {ratio:.1f} sigma, {in_frames}')
             elif not marker.trusted and share < RELEASE:
                 self._set_standing(markers, marker.id, '')

@@ -8,7 +8,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry.reprojection import sides_px
 from thermal_fiducial.core.mapping.located import Sight
-from thermal_fiducial.core.mapping.map_data import MEMORY
+from thermal_fiducial.core.mapping.map_data import NEW_FRAME_SHARE
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
 #: Share of the last frames of a marker that counts as most of them.
@@ -37,7 +37,7 @@ class ContradictedMap:
         for key, good in zip(sight.observed.ids.tolist(), agrees.tolist(), strict=True):
             for shares, is_one in ((self._agrees, good), (self._contradicts, not good)):
                 share = shares.get(key, 0.0)
-                shares[key] = share + MEMORY * (is_one - share)
+                shares[key] = share + NEW_FRAME_SHARE * (is_one - share)
         right, wrong = (sum(share > MOST for share in shares.values()) for shares in (self._agrees, self._contradicts))
         if 2 * right > len(self._agrees):
             self.doubt = ''

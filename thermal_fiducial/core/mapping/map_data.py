@@ -27,8 +27,8 @@ _OUTLIER = 4.0
 # Residual that is never an outlier [m].
 _TOLERANCE_M = 0.01
 _REWEIGHTINGS = 4
-#: Weight of a new frame in what is known of a marker: a memory of 20 frames.
-MEMORY = 0.05
+#: Weight of a new frame in running means over the frames of a marker, its errors and its quarantine: a memory of 20.
+NEW_FRAME_SHARE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ class MapMarker:
         """The marker after one more observation; without ``replace``, as this runs for every marker of every frame."""
         count = self.observations + 1
         mean_square = self.reprojection_error_px**2
-        mean_square += max(1.0 / count, MEMORY) * (error_px**2 - mean_square)
+        mean_square += max(1.0 / count, NEW_FRAME_SHARE) * (error_px**2 - mean_square)
         first = self.first_seen_ns if self.observations else stamp_ns
         return MapMarker(
             self.id, self.size, self.fixed, self.T_map_marker, self.covariance,
