@@ -40,6 +40,13 @@ def test_the_design_names_files_that_are_there(page):
     assert [name for name in sorted(named) if not sources_named(name)] == []
 
 
+@pytest.mark.parametrize('folder', ['core', 'core/mapping'])
+def test_the_design_lists_each_module(folder):
+    listed = set(re.findall(r'(?m)^(\w+)\.py ', MAPS_OF_THE_CODE[1].read_text(encoding='utf-8')))
+    modules = {path.stem for path in (ROOT / 'thermal_fiducial' / folder).glob('*.py')} - {'__init__'}
+    assert sorted(modules - listed) == []
+
+
 def test_what_to_open_names_functions_of_these_files():
     page = (ROOT / 'doc' / 'CONTRIBUTING.md').read_text(encoding='utf-8')
     pairs = re.findall(r'`([\w/]+\.py)` \(([^)]*)\)', page)
