@@ -6,7 +6,7 @@ from support.batch_map import adjust
 from support.walls import CAMERA, flight, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.se3 import difference
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import corners_px

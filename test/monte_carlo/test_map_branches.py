@@ -5,7 +5,7 @@ import pytest
 from support.walls import CAMERA, look, see, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.se3 import difference
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 

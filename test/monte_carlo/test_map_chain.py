@@ -10,7 +10,7 @@ from support.walls import CAMERA, hung, look, see, SIZE, stamp
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import CORNER_LENGTH, SystematicErrors
-from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.se3 import difference
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import CORNER_FIELDS, corners_px

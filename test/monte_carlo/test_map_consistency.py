@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 from support.walls import CAMERA, flight, NO_SYSTEMATIC_ERRORS, see, SIZE, wall
 
-from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.geometry.se3 import difference, retract
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.keyframes import Keyframe, snapshot_of
 from thermal_fiducial.core.mapping.map_data import MapMarker

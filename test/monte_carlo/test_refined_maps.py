@@ -9,7 +9,7 @@ from support.wrong_lenses import drawn_lens
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import CORNER_LENGTH, SystematicErrors
-from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.geometry.se3 import difference, retract
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import corners_px
 from thermal_fiducial.map_tools.map_building import build_map

@@ -10,7 +10,7 @@ from support.opencv import opencv_detector, opencv_dictionary
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.se3 import difference
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map

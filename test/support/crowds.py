@@ -3,8 +3,7 @@
 import numpy as np
 
 from support.walls import flight, see
-from thermal_fiducial.core.geometry.reprojection import retract
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import retract, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 
 SIZE = 0.15

@@ -8,7 +8,7 @@ from support.flights import config
 from thermal_fiducial.core.filter.initialization import blank_state
 from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
 from thermal_fiducial.core.filter.state import Estimate, SIZE
-from thermal_fiducial.core.geometry import reprojection
+from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian_inverse, so3_log, transform
 
 #: Far from everything: its systematic error is another one.
@@ -33,7 +33,7 @@ def difference(state, other):
             phi,
             so3_left_jacobian_inverse(phi) @ extrinsics[:3, 3],
             other.systematic - state.systematic,
-            reprojection.difference(other.T_map_markers @ np.linalg.inv(state.T_map_markers), np.eye(4)),
+            se3.difference(other.T_map_markers @ np.linalg.inv(state.T_map_markers), np.eye(4)),
         )
     )
 

@@ -16,8 +16,7 @@ from support.flights import config, errors, Flight, in_order, Motion, run_watche
 from support.sim_flights import simulated
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.geometry.reprojection import lever_arm
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import lever_arm, so3_exp, transform
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 
 Figures = dict[str, float]

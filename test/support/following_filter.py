@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from support.scenes import motion_prior
-from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.geometry.se3 import difference, retract
 from thermal_fiducial.core.measurements import Odometry
 
 #: Share of the difference from a pose that the filter takes over, at 8 to 15 frames a second: time constant 0.2 s.

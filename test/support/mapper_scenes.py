@@ -16,8 +16,7 @@ from support.scenes import motion_prior
 from support.wrong_lenses import bent_corridor
 from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.geometry.reprojection import difference, retract
-from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, transform
+from thermal_fiducial.core.geometry.se3 import difference, inverse, quaternion_from_rotation, retract, transform
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper

@@ -5,8 +5,8 @@ import numpy as np
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject, screw_difference
-from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, so3_exp, transform
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, screw_difference, so3_exp, transform
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE, Odometry
 

@@ -7,7 +7,7 @@ import numpy as np
 from support import walls
 from support.following_filter import FollowingFilter
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.geometry.se3 import difference, retract
 from thermal_fiducial.core.mapping.keyframes import VIEWS
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.reprojection import lever_arm
+from thermal_fiducial.core.geometry.se3 import lever_arm
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 

@@ -13,8 +13,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from thermal_fiducial.core.geometry.plausibility import require_numbers
-from thermal_fiducial.core.geometry.reprojection import turned
-from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion, turned
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked
 from thermal_fiducial.errors import InputError
 

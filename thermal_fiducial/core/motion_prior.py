@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from thermal_fiducial.core.error_model import covariance_of_motion, covariance_of_one_error, covariance_root
-from thermal_fiducial.core.geometry.reprojection import lever_arm, turned
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import lever_arm, so3_exp, transform, turned
 from thermal_fiducial.core.measurements import CameraPose, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 

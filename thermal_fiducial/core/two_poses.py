@@ -10,8 +10,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.error_model import covariance_of_one_error
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, screwed, turned
-from thermal_fiducial.core.geometry.se3 import so3_exp
+from thermal_fiducial.core.geometry.se3 import difference, lever_arm, screwed, so3_exp, turned
 from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
 from thermal_fiducial.core.types import FloatArray
 

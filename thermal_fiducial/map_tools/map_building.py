@@ -9,8 +9,8 @@ import numpy as np
 from thermal_fiducial.config import MarkerMapperConfig, MOST_KEYFRAMES
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, reproject
-from thermal_fiducial.core.geometry.se3 import turn_between
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
+from thermal_fiducial.core.geometry.se3 import difference, turn_between
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import UNAMBIGUOUS

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, lever_arm, turned
+from thermal_fiducial.core.geometry.reprojection import corners_in_map
+from thermal_fiducial.core.geometry.se3 import lever_arm, turned
 from thermal_fiducial.core.mapping.map_data import align, Alignment, MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.core.wording import listed

@@ -15,8 +15,8 @@ from thermal_fiducial.cli import map_sources
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.cli.map_plot import draw_map
 from thermal_fiducial.cli.run_parameters import camera_of_run
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, retract
-from thermal_fiducial.core.geometry.se3 import apply, inverse, so3_exp, transform
+from thermal_fiducial.core.geometry.reprojection import corners_in_map
+from thermal_fiducial.core.geometry.se3 import apply, difference, inverse, retract, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.files.camera_info import save_camera

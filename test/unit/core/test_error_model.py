@@ -17,7 +17,7 @@ from thermal_fiducial.core.error_model import (
     scale_of_map,
     SystematicErrors,
 )
-from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.geometry.se3 import difference, retract
 from thermal_fiducial.core.mapping.corner_bias import CornerBias
 from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import Location, Sight

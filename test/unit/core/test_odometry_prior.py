@@ -8,8 +8,7 @@ from support.walls import flight, stamp
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.geometry.reprojection import difference
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import difference, so3_exp, transform
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import extrapolated, predicted_camera
 

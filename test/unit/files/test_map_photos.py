@@ -9,7 +9,8 @@ from support.opencv import need_4_7
 from support.walls import CAMERA, flight, SIZE, wall
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, reproject
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
+from thermal_fiducial.core.geometry.se3 import difference
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary

@@ -21,7 +21,7 @@ from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
 from thermal_fiducial.core.filter.propagation import propagated, random_walks
 from thermal_fiducial.core.filter.state import clock_offset_derivative, embedded_core, SIZE, TIME_OFFSET
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
-from thermal_fiducial.core.geometry.reprojection import screw_difference
+from thermal_fiducial.core.geometry.se3 import screw_difference
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.two_poses import DECISIVE, possible_poses, unknown_turn
 from thermal_fiducial.core.types import SECOND_NS

@@ -16,8 +16,7 @@ import numpy as np
 
 from thermal_fiducial.core.filter.evidence import ClockEvidence, MountEvidence
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
-from thermal_fiducial.core.geometry.reprojection import lever_arm, retract
-from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_left_jacobian, transform
+from thermal_fiducial.core.geometry.se3 import inverse, lever_arm, retract, so3_exp, so3_left_jacobian, transform
 from thermal_fiducial.core.types import FloatArray
 
 #: Error coordinates by index. Core, expressed in the robot frame [rad, m/s, m],

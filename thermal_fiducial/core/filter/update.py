@@ -32,8 +32,7 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry.reprojection import lever_arm
-from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian, so3_log
+from thermal_fiducial.core.geometry.se3 import inverse, lever_arm, skew, so3_left_jacobian, so3_log
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray, TINY
 

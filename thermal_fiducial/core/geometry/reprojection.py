@@ -1,29 +1,18 @@
 """Markers as a camera sees them: re-projected corners, with derivatives, quadrilaterals in an image, thick plates.
 
-Poses are perturbed in the ROS convention of :mod:`thermal_fiducial.core.measurements`: ``d`` is (x y z, rotation
-about x y z), both in the map frame. With ``p_camera = R' (R_m c + t_m - t)`` for a corner ``c`` of the marker,
+Poses are displaced as by :func:`thermal_fiducial.core.geometry.se3.retract`, in the map frame. With
+``p_camera = R' (R_m c + t_m - t)`` for a corner ``c`` of the marker,
 ``dp_camera = R' (dt_m - [R_m c]x dr_m - dt + [R_m c + t_m - t]x dr)``.
 """
 
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.geometry.se3 import (
-    apply,
-    inverse,
-    skew,
-    so3_exp,
-    so3_left_jacobian,
-    so3_left_jacobian_inverse,
-    so3_log,
-)
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.se3 import apply, inverse, skew
 from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
-
-if TYPE_CHECKING:
-    # Not imported here: the filter uses this module, and restarts sooner without OpenCV.
-    from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 
 #: Numbers in either precision.
 Real = TypeVar('Real', FloatArray, Float32Array)
@@ -32,56 +21,6 @@ Real = TypeVar('Real', FloatArray, Float32Array)
 _UNIT_CORNERS = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
 # Of a corner of a quadrilateral, the next and the opposite one.
 _NEXT, _OPPOSITE = np.array([1, 2, 3, 0]), np.array([2, 3, 0, 1])
-
-
-def retract(T: npt.ArrayLike, d: npt.ArrayLike) -> FloatArray:
-    """Pose (..., 4, 4) moved by ``d`` (..., 6) in its parent frame: ``p + d[:3]``, ``exp(d[3:]) R``."""
-    d = np.asarray(d, dtype=np.float64)
-    moved = np.array(T, dtype=np.float64)
-    moved[..., :3, :3] = so3_exp(d[..., 3:]) @ moved[..., :3, :3]
-    moved[..., :3, 3] += d[..., :3]
-    return moved
-
-
-def difference(T: npt.ArrayLike, T_reference: npt.ArrayLike) -> FloatArray:
-    """``d`` (..., 6) with ``T == retract(T_reference, d)``."""
-    T, T_reference = np.asarray(T, dtype=np.float64), np.asarray(T_reference, dtype=np.float64)
-    rotation = so3_log(T[..., :3, :3] @ T_reference[..., :3, :3].swapaxes(-1, -2))
-    return np.concatenate([T[..., :3, 3] - T_reference[..., :3, 3], rotation], axis=-1)
-
-
-def screwed(T: FloatArray, d: FloatArray) -> FloatArray:
-    """Pose (4, 4) moved by ``d`` (6,) along a screw: as by :func:`retract` to first order, but about a point it orbits.
-
-    The exponential of SE(3), in these coordinates.
-    """
-    moved = T.copy()
-    moved[:3, :3] = so3_exp(d[3:]) @ T[:3, :3]
-    moved[:3, 3] += so3_left_jacobian(d[3:]) @ d[:3]
-    return moved
-
-
-def screw_difference(T: FloatArray, T_reference: FloatArray) -> FloatArray:
-    """``d`` (6,) with ``T == screwed(T_reference, d)``."""
-    rotation = so3_log(T[:3, :3] @ T_reference[:3, :3].T)
-    return np.concatenate([so3_left_jacobian_inverse(rotation) @ (T[:3, 3] - T_reference[:3, 3]), rotation])
-
-
-def lever_arm(arm: FloatArray) -> FloatArray:
-    """Map (..., 6, 6) from a displacement ``d`` of a body to that of a point at ``arm`` (..., 3) from its origin."""
-    J = np.zeros((*arm.shape[:-1], 6, 6))
-    J[...] = np.eye(6)
-    J[..., :3, 3:] = -skew(arm)
-    return J
-
-
-def twist_transfer(T_body_frame: FloatArray) -> FloatArray:
-    """Map (6, 6) from the twist of a body to that of a frame at ``T_body_frame`` (4, 4) on it, each in its own axes."""
-    R = T_body_frame[:3, :3].T
-    transfer = np.zeros((6, 6))
-    transfer[:3, :3] = transfer[3:, 3:] = R
-    transfer[:3, 3:] = -R @ skew(T_body_frame[:3, 3])
-    return transfer
 
 
 def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
@@ -100,19 +39,6 @@ def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
     return J
 
 
-def turn_of_pose(R: FloatArray) -> FloatArray:
-    """Map (6, 6) of a displacement of a pose, or a twist, by the rotation ``R`` (3, 3) of its axes."""
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = R
-    return turn
-
-
-def turned(covariance: FloatArray, R: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of a pose or twist, rotated by ``R`` (3, 3) into other axes."""
-    turn = turn_of_pose(R)
-    return np.asarray(turn @ covariance @ turn.T)
-
-
 def marker_corners(sizes: npt.ArrayLike) -> FloatArray:
     """Corners (..., 4, 3) [m] of markers of ``sizes`` (...) in their own frames, clockwise from the top-left."""
     return np.asarray(0.5 * np.asarray(sizes, dtype=np.float64)[..., None, None] * _UNIT_CORNERS)
@@ -123,14 +49,14 @@ def corners_in_map(T_map_marker: FloatArray, sizes: npt.ArrayLike) -> FloatArray
     return apply(T_map_marker, marker_corners(sizes))
 
 
-def reproject(camera: 'Camera', T_map_camera: FloatArray, points: FloatArray) -> FloatArray:
+def reproject(camera: Camera, T_map_camera: FloatArray, points: FloatArray) -> FloatArray:
     """Pixels (..., 4, 2) of corners ``points`` (..., 4, 3) in the map, for cameras (..., 4, 4); NaN: unseen."""
     relative = points - T_map_camera[..., None, :3, 3]
     return camera.project(relative @ T_map_camera[..., :3, :3])
 
 
 def linearise(
-    camera: 'Camera', T_map_camera: FloatArray, T_map_marker: FloatArray, sizes: npt.ArrayLike
+    camera: Camera, T_map_camera: FloatArray, T_map_marker: FloatArray, sizes: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pixels of the corners of markers, and their derivatives with respect to both poses.
 
@@ -237,9 +163,7 @@ def perspective(c: FloatArray) -> FloatArray:
     return np.asarray(triangle)
 
 
-def corners_of_faces(
-    at: 'ImagePoints', T_camera_marker: FloatArray, sizes: FloatArray, thickness: float
-) -> 'ImagePoints':
+def corners_of_faces(at: ImagePoints, T_camera_marker: FloatArray, sizes: FloatArray, thickness: float) -> ImagePoints:
     """Corners of the faces of N markers in plates of some thickness.
 
     From the side, outlines are larger than faces, and those of holes smaller: the cut sides of a plate are as cold as

@@ -12,7 +12,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
-from thermal_fiducial.core.geometry.reprojection import retract
+from thermal_fiducial.core.geometry.se3 import retract
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
 _MAX_STEPS = 20

@@ -1,7 +1,10 @@
-"""Rotations and rigid transforms.
+"""Rotations and rigid transforms, small displacements of poses, and what these are for other frames.
 
 ``T_a_b`` is 4x4 and maps coordinates in b to coordinates in a, ``p_a = T_a_b @ p_b``; inner names cancel.
 Rotation vectors are in radians. All functions accept leading batch dimensions unless they say otherwise.
+
+A displacement ``d`` (6,) of a pose is in the ROS convention of :mod:`thermal_fiducial.core.measurements`: x y z [m],
+then the rotation about x y z [rad], both in the parent frame. Covariances of poses are those of such displacements.
 
 Source of the closed forms: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in
 robotics", 2018, appendices B and D.
@@ -196,3 +199,66 @@ def rotation_angle(R: npt.ArrayLike) -> FloatArray:
 def turn_between(T: FloatArray, other: FloatArray) -> FloatArray:
     """Angle (...) [rad] by which poses ``other`` (..., 4, 4) are turned against one, ``T`` (4, 4)."""
     return rotation_angle(T[:3, :3].T @ other[..., :3, :3])
+
+
+def retract(T: npt.ArrayLike, d: npt.ArrayLike) -> FloatArray:
+    """Pose (..., 4, 4) moved by ``d`` (..., 6) in its parent frame: ``p + d[:3]``, ``exp(d[3:]) R``."""
+    d = np.asarray(d, dtype=np.float64)
+    moved = np.array(T, dtype=np.float64)
+    moved[..., :3, :3] = so3_exp(d[..., 3:]) @ moved[..., :3, :3]
+    moved[..., :3, 3] += d[..., :3]
+    return moved
+
+
+def difference(T: npt.ArrayLike, T_reference: npt.ArrayLike) -> FloatArray:
+    """``d`` (..., 6) with ``T == retract(T_reference, d)``."""
+    T, T_reference = np.asarray(T, dtype=np.float64), np.asarray(T_reference, dtype=np.float64)
+    rotation = so3_log(T[..., :3, :3] @ T_reference[..., :3, :3].swapaxes(-1, -2))
+    return np.concatenate([T[..., :3, 3] - T_reference[..., :3, 3], rotation], axis=-1)
+
+
+def screwed(T: FloatArray, d: FloatArray) -> FloatArray:
+    """Pose (4, 4) moved by ``d`` (6,) along a screw: as by :func:`retract` to first order, but about a point it orbits.
+
+    The exponential of SE(3), in these coordinates.
+    """
+    moved = T.copy()
+    moved[:3, :3] = so3_exp(d[3:]) @ T[:3, :3]
+    moved[:3, 3] += so3_left_jacobian(d[3:]) @ d[:3]
+    return moved
+
+
+def screw_difference(T: FloatArray, T_reference: FloatArray) -> FloatArray:
+    """``d`` (6,) with ``T == screwed(T_reference, d)``."""
+    rotation = so3_log(T[:3, :3] @ T_reference[:3, :3].T)
+    return np.concatenate([so3_left_jacobian_inverse(rotation) @ (T[:3, 3] - T_reference[:3, 3]), rotation])
+
+
+def lever_arm(arm: FloatArray) -> FloatArray:
+    """Map (..., 6, 6) from a displacement ``d`` of a body to that of a point at ``arm`` (..., 3) from its origin."""
+    J = np.zeros((*arm.shape[:-1], 6, 6))
+    J[...] = np.eye(6)
+    J[..., :3, 3:] = -skew(arm)
+    return J
+
+
+def turn_of_pose(R: FloatArray) -> FloatArray:
+    """Map (6, 6) of a displacement of a pose, or a twist, by the rotation ``R`` (3, 3) of its axes."""
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = R
+    return turn
+
+
+def turned(covariance: FloatArray, R: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a pose or twist, rotated by ``R`` (3, 3) into other axes."""
+    turn = turn_of_pose(R)
+    return np.asarray(turn @ covariance @ turn.T)
+
+
+def twist_transfer(T_body_frame: FloatArray) -> FloatArray:
+    """Map (6, 6) from the twist of a body to that of a frame at ``T_body_frame`` (4, 4) on it, each in its own axes."""
+    R = T_body_frame[:3, :3].T
+    transfer = np.zeros((6, 6))
+    transfer[:3, :3] = transfer[3:, 3:] = R
+    transfer[:3, 3:] = -R @ skew(T_body_frame[:3, 3])
+    return transfer

@@ -9,9 +9,9 @@ import numpy as np
 from thermal_fiducial.config import CHI2_OF_POSE
 from thermal_fiducial.core.error_model import CHI2_OF_VIEW, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, marker_corners, retract, whitening
+from thermal_fiducial.core.geometry.reprojection import marker_corners, whitening
 from thermal_fiducial.core.geometry.rigid_fit import BEHIND_CHI2, Images, linearised, robust
-from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.geometry.se3 import difference, inverse, lever_arm, retract
 from thermal_fiducial.core.lens_errors import of_aspect
 from thermal_fiducial.core.mapping.map_data import exact, gauge, MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations, Vectors

@@ -15,8 +15,8 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import noise_factor
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import retract
 from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
+from thermal_fiducial.core.geometry.se3 import retract
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Poses, Snapshot
 from thermal_fiducial.core.mapping.candidates import MAX_VIEWS, UNAMBIGUOUS
 from thermal_fiducial.core.mapping.error_sources import ErrorSources

@@ -14,8 +14,7 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import covariance_of_one_error, INCONSISTENT_PX
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import difference
-from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
+from thermal_fiducial.core.geometry.se3 import difference, inverse, rotation_angle
 from thermal_fiducial.core.mapping.contradicted_map import ContradictedMap, MOST, most_px
 from thermal_fiducial.core.mapping.localization import names
 from thermal_fiducial.core.mapping.located import (

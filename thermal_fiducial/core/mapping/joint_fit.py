@@ -20,8 +20,7 @@ from thermal_fiducial.core.error_model import (
 )
 from thermal_fiducial.core.geometry.camera import Camera, inverse_2x2
 from thermal_fiducial.core.geometry.planar_pose import CameraFit, INLIER
-from thermal_fiducial.core.geometry.reprojection import lever_arm, retract, screw_difference, screwed
-from thermal_fiducial.core.geometry.se3 import turn_between
+from thermal_fiducial.core.geometry.se3 import lever_arm, retract, screw_difference, screwed, turn_between
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.located import Location, Reprojected, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE

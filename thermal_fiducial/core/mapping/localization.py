@@ -12,8 +12,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import covariance_of_one_error, decision_weights, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit
-from thermal_fiducial.core.geometry.reprojection import difference, screw_difference
-from thermal_fiducial.core.geometry.se3 import inverse, turn_between
+from thermal_fiducial.core.geometry.se3 import difference, inverse, screw_difference, turn_between
 from thermal_fiducial.core.mapping.joint_fit import Alternative, JointFit, SurveyedFit
 from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint

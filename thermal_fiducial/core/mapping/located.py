@@ -13,14 +13,8 @@ from thermal_fiducial.core.error_model import (
     NO_DRAWS,
 )
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import (
-    corners_in_map,
-    difference,
-    lever_arm,
-    linearise,
-    screwed,
-    turn_of_pose,
-)
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise
+from thermal_fiducial.core.geometry.se3 import difference, lever_arm, screwed, turn_of_pose
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint

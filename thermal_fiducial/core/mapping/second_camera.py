@@ -13,8 +13,7 @@ import numpy as np
 from thermal_fiducial.config import CHI2_OF_POSE
 from thermal_fiducial.core.camera_frames import FramePeriod
 from thermal_fiducial.core.error_model import CORRELATED_POSES, covariance_of_one_error
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
-from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.geometry.se3 import difference, inverse, lever_arm, retract
 from thermal_fiducial.core.mapping.located import squared_distance
 from thermal_fiducial.core.measurements import CameraPose, LATEST_NS
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera

@@ -21,7 +21,8 @@ from thermal_fiducial.core.error_model import (
 )
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, inverse_2x2
 from thermal_fiducial.core.geometry.planar_pose import INLIER, squareness
-from thermal_fiducial.core.geometry.reprojection import interaction, turn_of_pose, whitening
+from thermal_fiducial.core.geometry.reprojection import interaction, whitening
+from thermal_fiducial.core.geometry.se3 import turn_of_pose
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.motion_prior import PredictedCamera

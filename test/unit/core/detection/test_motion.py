@@ -8,7 +8,8 @@ from thermal_fiducial.core.detection.prediction.tracking import MeasuredCorners,
 from thermal_fiducial.core.detection.prediction.twist import Twist, twist_by_odometry
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import interaction, twist_transfer
+from thermal_fiducial.core.geometry.reprojection import interaction
+from thermal_fiducial.core.geometry.se3 import twist_transfer
 from thermal_fiducial.core.measurements import Odometry
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])

@@ -9,7 +9,7 @@ from support.flights import config
 
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis, PoseUpdate, REFUSALS_OF_DOUBT
 from thermal_fiducial.core.filter.state import POSITION
-from thermal_fiducial.core.geometry.reprojection import lever_arm
+from thermal_fiducial.core.geometry.se3 import lever_arm
 from thermal_fiducial.core.measurements import Condition
 
 CONFIG = config(initial_poses=3, reset_after=0.5, reinitialise_after=5.0, lost_position_std=1.0)

@@ -9,8 +9,14 @@ from support.flights import config, GRAVITY, START_NS, T_BODY_CAMERA
 from thermal_fiducial.core.error_model import covariance_of_one_error
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.initialization import TWO_POSES
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, screw_difference
-from thermal_fiducial.core.geometry.se3 import rotation_angle, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import (
+    difference,
+    lever_arm,
+    rotation_angle,
+    screw_difference,
+    so3_exp,
+    transform,
+)
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, NOTHING_KNOWN
 from thermal_fiducial.core.two_poses import mean_of_two, possible_poses
 

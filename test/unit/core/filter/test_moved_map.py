@@ -9,8 +9,7 @@ import pytest
 from support.flights import config, Flight
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
-from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import difference, inverse, lever_arm, retract, so3_exp, transform
 from thermal_fiducial.core.measurements import in_moved_map
 
 CORRECTIONS = {

@@ -35,8 +35,7 @@ from thermal_fiducial.core.filter.update import (
     mount_jacobian,
     pose_error,
 )
-from thermal_fiducial.core.geometry.reprojection import lever_arm, retract
-from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform
+from thermal_fiducial.core.geometry.se3 import inverse, lever_arm, retract, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN
 
 FULL = config(stamp_jitter=0.0, mount_vibration=0.0)

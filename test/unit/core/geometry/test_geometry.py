@@ -119,3 +119,31 @@ def test_one_rotation_gives_the_quaternion_that_a_batch_gives():
     # The same formulas in doubles; at half a turn the sign is free.
     sign = np.where(np.sum(batch * single, axis=1, keepdims=True) < 0.0, -1.0, 1.0)
     np.testing.assert_allclose(sign * single, batch, atol=1e-15)
+
+
+def test_difference_undoes_retract():
+    rng = np.random.default_rng(1)
+    T = se3.transform(se3.so3_exp(rng.normal(size=(20, 3))), rng.normal(size=(20, 3)))
+    d = np.clip(rng.normal(size=(20, 6)), -1.7, 1.7)  # rotations below pi
+    np.testing.assert_allclose(se3.difference(se3.retract(T, d), T), d, atol=1e-12)
+
+
+def test_a_screw_about_a_point_leaves_it_where_it_is():
+    rng = np.random.default_rng(7)
+    T, point, turn = (
+        se3.transform(se3.so3_exp(rng.normal(size=3)), rng.normal(size=3)),
+        rng.normal(size=3),
+        rng.normal(size=3),
+    )
+    d = np.concatenate((np.cross(turn, T[:3, 3] - point), turn))
+    moved = se3.screwed(T, d)
+    # As a point of the camera.
+    inside = T[:3, :3].T @ (point - T[:3, 3])
+    np.testing.assert_allclose(moved[:3, :3] @ inside + moved[:3, 3], point, atol=1e-12)
+    np.testing.assert_allclose(se3.screw_difference(moved, T), d, atol=1e-12)
+    # Half of it twice is all of it, with the half seen from where the first one ends.
+    half = se3.screwed(T, 0.5 * d)
+    np.testing.assert_allclose(se3.screwed(half, se3.lever_arm(half[:3, 3] - T[:3, 3]) @ (0.5 * d)), moved, atol=1e-12)
+    small = 1e-4 * d
+    # Of second order.
+    np.testing.assert_allclose(se3.screwed(T, small), se3.retract(T, small), atol=1e-7)

@@ -4,16 +4,8 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import (
-    difference,
-    lever_arm,
-    linearise,
-    retract,
-    screw_difference,
-    screwed,
-    whitening,
-)
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.geometry.reprojection import linearise, whitening
+from thermal_fiducial.core.geometry.se3 import retract, so3_exp, transform
 
 CAMERAS = [
     Camera(640, 512, np.array([[440.0, 0.0, 320.0], [0.0, 442.0, 250.0], [0.0, 0.0, 1.0]]), model, D)
@@ -54,33 +46,9 @@ def test_derivatives_are_those_of_the_pixels(camera):
             np.testing.assert_allclose(J[..., axis], numeric, rtol=1e-5, atol=2e-3)
 
 
-def test_difference_undoes_retract():
-    rng = np.random.default_rng(1)
-    T = transform(so3_exp(rng.normal(size=(20, 3))), rng.normal(size=(20, 3)))
-    d = np.clip(rng.normal(size=(20, 6)), -1.7, 1.7)  # rotations below pi
-    np.testing.assert_allclose(difference(retract(T, d), T), d, atol=1e-12)
-
-
 def test_whitening_makes_the_covariance_a_unit():
     rng = np.random.default_rng(2)
     A = rng.normal(size=(7, 4, 2, 2))
     C = A @ np.swapaxes(A, -1, -2) + 0.1 * np.eye(2)
     W = whitening(C)
     np.testing.assert_allclose(W @ C @ np.swapaxes(W, -1, -2), np.broadcast_to(np.eye(2), C.shape), atol=1e-12)
-
-
-def test_a_screw_about_a_point_leaves_it_where_it_is():
-    rng = np.random.default_rng(7)
-    T, point, turn = transform(so3_exp(rng.normal(size=3)), rng.normal(size=3)), rng.normal(size=3), rng.normal(size=3)
-    d = np.concatenate((np.cross(turn, T[:3, 3] - point), turn))
-    moved = screwed(T, d)
-    # As a point of the camera.
-    inside = T[:3, :3].T @ (point - T[:3, 3])
-    np.testing.assert_allclose(moved[:3, :3] @ inside + moved[:3, 3], point, atol=1e-12)
-    np.testing.assert_allclose(screw_difference(moved, T), d, atol=1e-12)
-    # Half of it twice is all of it, with the half seen from where the first one ends.
-    half = screwed(T, 0.5 * d)
-    np.testing.assert_allclose(screwed(half, lever_arm(half[:3, 3] - T[:3, 3]) @ (0.5 * d)), moved, atol=1e-12)
-    small = 1e-4 * d
-    # Of second order.
-    np.testing.assert_allclose(screwed(T, small), retract(T, small), atol=1e-7)

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.rigid_fit import costs, evaluate, Images, minimise
-from thermal_fiducial.core.geometry.se3 import apply, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import apply, difference, retract, so3_exp, transform
 
 #: Robust limit of the errors, in standard deviations: with the noise below some points are beyond it.
 INLIER = 1.5

@@ -10,8 +10,8 @@ from support.walls import hung, look, see
 from support.walls import rows as rows_of
 
 from thermal_fiducial.core.error_model import covariance_by_draws, DRAWS, NO_DRAWS, SystematicErrors
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, marker_corners, retract
-from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
+from thermal_fiducial.core.geometry.reprojection import marker_corners
+from thermal_fiducial.core.geometry.se3 import difference, inverse, lever_arm, retract, so3_exp, transform
 from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers, WRONG_SIDE
 from thermal_fiducial.core.mapping.marker_views import MarkerView, MarkerViews, Viewpoint
 from thermal_fiducial.core.measurements import corners_px, NOTHING_KNOWN, Observations

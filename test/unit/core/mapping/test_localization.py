@@ -9,8 +9,16 @@ from support.walls import CAMERA, flight, look, rows, see, SIZE, wall
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit
-from thermal_fiducial.core.geometry.reprojection import difference, retract, screw_difference, screwed, turned
-from thermal_fiducial.core.geometry.se3 import rotation_angle, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import (
+    difference,
+    retract,
+    rotation_angle,
+    screw_difference,
+    screwed,
+    so3_exp,
+    transform,
+    turned,
+)
 from thermal_fiducial.core.mapping.joint_fit import JointFit, marker_weights
 from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import Location, Refusal, Sight

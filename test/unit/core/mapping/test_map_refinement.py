@@ -9,8 +9,8 @@ from support.walls import CAMERA, flight, mirrored, NO_SYSTEMATIC_ERRORS, see, S
 from support.wrong_lenses import drawn_lens
 
 from thermal_fiducial.core.error_model import covariance_by_draws, draws_of, SystematicErrors
-from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract
-from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, so3_exp, transform
+from thermal_fiducial.core.geometry.reprojection import linearise
+from thermal_fiducial.core.geometry.se3 import difference, inverse, retract, rotation_angle, so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
 from thermal_fiducial.core.mapping.adjustment_problem import MapProblem
 from thermal_fiducial.core.mapping.keyframes import Keyframe, prior_poses, snapshot_of

@@ -11,8 +11,7 @@ from support.walls import rows as rows_of
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import covariance_by_draws
-from thermal_fiducial.core.geometry.reprojection import difference, retract
-from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import difference, inverse, retract, so3_exp, transform
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import CONTRADICTED, MarkerMapper

@@ -10,8 +10,7 @@ from support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import NO_DRAWS
-from thermal_fiducial.core.geometry.reprojection import difference, retract
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import difference, retract, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import MARKER_DTYPE, Odometry, VAGUE

@@ -15,8 +15,8 @@ from support.messages import frames, info
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector, rows_from_corners
 from thermal_fiducial.core.error_model import covariance_of_mount
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, reproject
-from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
+from thermal_fiducial.core.geometry.se3 import difference, inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.second_camera import intersection, SecondCamera, SecondClock, seen_from
 from thermal_fiducial.core.measurements import CameraPose, MARKER_DTYPE, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior

@@ -22,7 +22,7 @@ from support.walls import (
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.geometry.camera import ImagePoints
-from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.se3 import difference
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.undeclared_readout import ReadoutEstimate, UndeclaredReadout

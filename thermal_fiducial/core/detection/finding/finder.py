@@ -28,7 +28,8 @@ from thermal_fiducial.core.detection.prediction.tracking import Guide, MotionTra
 from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
-from thermal_fiducial.core.geometry.reprojection import diagonals, sides_px, turned
+from thermal_fiducial.core.geometry.reprojection import diagonals, sides_px
+from thermal_fiducial.core.geometry.se3 import turned
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS
 
 # Polarity: memory in frames that show markers, and the surplus of markers of one polarity from which on it is certain.

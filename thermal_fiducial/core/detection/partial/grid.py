@@ -42,7 +42,8 @@ from thermal_fiducial.core.detection.prediction.frame import (
 )
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.reprojection import outlines_on_faces, retract
+from thermal_fiducial.core.geometry.reprojection import outlines_on_faces
+from thermal_fiducial.core.geometry.se3 import retract
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
 
 # Columns of pixels across an edge.

@@ -19,7 +19,8 @@ from thermal_fiducial.core.detection.prediction.twist import (
 )
 from thermal_fiducial.core.error_model import UNKNOWN_ACCELERATION
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.reprojection import interaction, twist_transfer
+from thermal_fiducial.core.geometry.reprojection import interaction
+from thermal_fiducial.core.geometry.se3 import twist_transfer
 from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS, Stacked
 

@@ -54,7 +54,7 @@ def twist_by_odometry(
 
     Parameters
     ----------
-    transfer : (6, 6) of :func:`thermal_fiducial.core.geometry.reprojection.twist_transfer`
+    transfer : (6, 6) of :func:`thermal_fiducial.core.geometry.se3.twist_transfer`
     lag : time constant of the bolometers [s]
     clock_std_s : standard deviation of the stamp in the odometry's clock [s]
     """
