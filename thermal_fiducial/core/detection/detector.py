@@ -99,14 +99,14 @@ class MarkerDetector:
         keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
         frame = Frame.of(stamp_ns, counts, camera, twist, config, keep_columns=keep_columns)
         found, history = self._finder.find(frame, history, known, guide, config)
-        refined, scale = self._refined(frame, found, history)
+        refined, gray_scale = self._refined(frame, found, history)
         if len(found.ids) > 1 and not len(refined.ids) and refined.blur.to_tails is not None:
             # A filter that diverges, as with an IMU in degrees, has motion blur taken out of images that have none. A
             # single faint marker may be refuted by chance.
             unmoved = replace(frame, twist=None)
-            again, scale_again = self._refined(unmoved, found, history)
+            again, other_scale = self._refined(unmoved, found, history)
             if len(again.ids):
-                frame, guide, T_camera_map, refined, scale = unmoved, None, None, again, scale_again
+                frame, guide, T_camera_map, refined, gray_scale = unmoved, None, None, again, other_scale
         ids, corners, at = refined.ids, refined.corners, refined.places.at
         poses = self._poses(ids, corners.covariances, at, T_camera_map)
         if config.plate_thickness > 0.0:
@@ -114,18 +114,18 @@ class MarkerDetector:
             poses = self._poses(ids, corners.covariances, at, T_camera_map)
         rows = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
         if guide is not None and among(ids, known.ids).sum() < _ENOUGH_WHOLE:
-            rows = self._with_partial(rows, frame, scale, guide)
+            rows = self._with_partial(rows, frame, gray_scale, guide)
         # A twist by corners of which none was confirmed as a marker's is dropped.
         twist = refined.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], known.sizes[ids])
         markers = ExpectedMarkers(ids, refined.places.at.x, depth, corners.contrast / frame.noise)
-        self._history = history.after(stamp_ns, twist, markers, scale, saw_partial=len(rows) > len(ids))
+        self._history = history.after(stamp_ns, twist, markers, gray_scale, saw_partial=len(rows) > len(ids))
         return rows
 
     def _refined(self, frame: Frame, found: FoundMarkers, history: FrameHistory) -> tuple[RefinedMarkers, GrayScale]:
         """Those of the markers ``found`` that are confirmed at their refined corners, and the gray scale."""
-        refined, scale = refine(frame, found, history.track, history.gray_scale, self._decoder)
-        return confirmed(frame, found, refined, self._decoder, self.config), scale
+        refined, gray_scale = refine(frame, found, history.track, history.gray_scale, self._decoder)
+        return confirmed(frame, found, refined, self._decoder, self.config), gray_scale
 
     def _poses(
         self, ids: IntArray, covariances: FloatArray, at: ImagePoints, T_camera_map: FloatArray | None
@@ -135,12 +135,12 @@ class MarkerDetector:
         poses = planar_poses(at, covariances, sizes)
         return choose_branches(poses, at, covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
 
-    def _with_partial(self, rows: Markers, frame: Frame, scale: GrayScale, guide: Guide) -> Markers:
+    def _with_partial(self, rows: Markers, frame: Frame, gray_scale: GrayScale, guide: Guide) -> Markers:
         """The rows of whole markers, and those of known ones that are partially visible from the ``guide``."""
         found_ids = rows['id'].astype(np.int64)
         candidates = self._known.partially_visible(guide.T_camera_map, frame.camera, found_ids)
         position_std_m = math.sqrt(np.trace(guide.covariance[:3, :3]))
-        ids, corners = self._partial.look(frame, scale, candidates, position_std_m, self.config)
+        ids, corners = self._partial.look(frame, gray_scale, candidates, position_std_m, self.config)
         if len(ids) == 0:
             return rows
         at = ImagePoints.at(corners.corners_px, frame.camera)

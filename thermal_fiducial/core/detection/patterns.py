@@ -161,14 +161,14 @@ class Decoder:
             nothing = np.zeros(0)
             none = nothing.astype(np.int64)
             return Reading(none, none, nothing, nothing, nothing, none, nothing)
-        match = self.likeness(image, quads, allowed, lag_tails)
+        match = self.best_match(image, quads, allowed, lag_tails)
         steps = np.zeros((len(quads), 4))
         alike = np.flatnonzero(np.abs(match.correlation) >= _SIMILAR)
         if len(alike):
             steps[alike] = self._steps(image, quads[alike], None if lag_tails is None else lag_tails[alike])
         return self._judged(match, steps)
 
-    def likeness(
+    def best_match(
         self, image: Pixels, quads: FloatArray, allowed: BoolArray | None = None, lag_tails: FloatArray | None = None
     ) -> PatternMatch:
         """Most similar patterns of quadrilaterals (Q, 4, 2), as :meth:`read`."""
@@ -183,7 +183,7 @@ class Decoder:
         size.reshape(len(quads), -1, 4)[rows, best // 4] = 0.0
         return PatternMatch(values, best, correlation, size.max(axis=1).astype(np.float64))
 
-    def match(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
+    def correlation(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
         """Correlation (Q,) of quadrilaterals (Q, 4, 2) with the upright patterns of ``ids`` (Q,)."""
         values = self._values(image, quads)
         spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), np.float32(TINY))

@@ -60,11 +60,11 @@ def drawn(markers, noise=0.0, shape=(240, 320), sign=1.0, seed=0):
     return (sign * image + rng.normal(0.0, noise, shape)).astype(np.float32)
 
 
-def template_of(image, marker_id, corners, reach, kinds=BOTH):
+def template_of(image, marker_id, corners, reach, polarities=BOTH):
     images = [image]
     for _ in range(halvings(sides_px(corners[None])[0] / DECODER.cells)):
         images.append(halved(images[-1]))
-    return MarkerTemplate(images, marker_id, corners, np.full(2, reach), kinds, DECODER)
+    return MarkerTemplate(images, marker_id, corners, np.full(2, reach), polarities, DECODER)
 
 
 @pytest.mark.parametrize('sign', BOTH)
@@ -82,7 +82,7 @@ def test_a_template_is_found_where_the_marker_is(side, sign):
 def test_of_another_polarity_or_outside_the_image_there_is_no_match():
     there = square((160.0, 120.0), 30.0)
     image = drawn({7: there}, noise=0.05)
-    other = template_of(image, 7, there + 9.0, 40.0, kinds=(-1.0,)).best(np.zeros(2), np.full(2, 40.0))
+    other = template_of(image, 7, there + 9.0, 40.0, polarities=(-1.0,)).best(np.zeros(2), np.full(2, 40.0))
     assert other.gain < UNDECIDED
     outside = template_of(image, 7, square((-60.0, 120.0), 30.0), 20.0)
     assert outside.best(np.zeros(2), np.full(2, 20.0)) is NOT_THERE
@@ -92,7 +92,7 @@ def test_a_plain_square_is_no_evidence_of_a_marker():
     there = square((160.0, 120.0), 30.0)
     image = drawn({}, noise=0.05)
     cv2.fillConvexPoly(image, np.rint(there).astype(np.int32), 1.0)
-    match = template_of(image, 7, there, 20.0, kinds=(1.0,)).best(np.zeros(2), np.full(2, 20.0))
+    match = template_of(image, 7, there, 20.0, polarities=(1.0,)).best(np.zeros(2), np.full(2, 20.0))
     assert match.gain < UNDECIDED
 
 

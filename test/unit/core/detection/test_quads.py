@@ -11,11 +11,11 @@ from thermal_fiducial.core.detection.finding.quads import (
     find_quads,
     halfway,
     halved,
-    Scale,
+    Segmentation,
 )
 
 SHAPE = 240, 320
-FINE = Scale(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5, most=60.0)
+FINE = Segmentation(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5, most=60.0)
 NOTHING = np.zeros((0, 4, 2))
 #: Clockwise from the top left.
 QUAD = np.array([[80.0, 60.0], [140.0, 70.0], [130.0, 130.0], [70.0, 115.0]])

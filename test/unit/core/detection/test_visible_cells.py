@@ -32,7 +32,7 @@ def cut(image, columns):
 
 
 def match(image, px, marker_id=ID):
-    return CELLS.match(image, px[None], marker_id)[0]
+    return CELLS.correlation(image, px[None], marker_id)[0]
 
 
 def test_a_whole_view_shows_its_marker():
@@ -65,7 +65,7 @@ def test_too_few_cells_match_nothing():
 
 def test_correlation_is_best_at_the_marker_s_place():
     off = np.array([[0.0, 0.0], [6.0, 0.0], [0.0, -6.0], [8.0, 8.0]])
-    similarity = CELLS.match(picture(), places() + off[:, None], ID)
+    similarity = CELLS.correlation(picture(), places() + off[:, None], ID)
     assert similarity.argmax() == 0
     assert similarity[0] == pytest.approx(1.0, abs=1e-6)
 

@@ -74,41 +74,41 @@ class RefinedMarkers(Stacked):
 
 
 def refine(
-    frame: Frame, found: FoundMarkers, track: MotionTrack, scale: GrayScale, decoder: Decoder
+    frame: Frame, found: FoundMarkers, track: MotionTrack, gray_scale: GrayScale, decoder: Decoder
 ) -> tuple[RefinedMarkers, GrayScale]:
     """Corners of N markers, and the gray scale of the display as it is known then.
 
     Parameters
     ----------
     track : motion and markers of the last frame, which with the corners give the twist
-    scale : of the display, as far as it is known; counts have none
+    gray_scale : of the display, as far as it is known; counts have none
     decoder : of the dictionary
     """
     if len(found.ids) == 0:
         corners = RefinedCorners.none()
-        return RefinedMarkers(found.ids, corners, MotionBlur.none(0), corners, found.places, frame.twist), scale
+        return RefinedMarkers(found.ids, corners, MotionBlur.none(0), corners, found.places, frame.twist), gray_scale
     clear = np.abs(found.cnr).min() > CLEAR_CNR
     columns = OF_CLEAR if clear else OF_FAINT
-    twist, places, of_last = frame.twist, found.places, scale
+    twist, places, of_last = frame.twist, found.places, gray_scale
     # Markers whose places are accurate to a pixel or two, no better.
     rough = ~found.certain
     for _ in range(_ROUNDS_ON_DISPLAYS if frame.displayed else _ROUNDS):
-        blur, before = motion_blur(frame, places, twist), scale
+        blur, before = motion_blur(frame, places, twist), gray_scale
         start = places.at.at_pixels(places.at.px + blur.shift)
         bent = frame.displayed and blur.to_tails is not None
-        shown = frame.in_counts(scale.counts) if bent else frame
+        shown = frame.in_counts(gray_scale.counts) if bent else frame
         refined = _measured(shown, found, start, blur, columns, decoder, rough)
         markers = _at_stamp(frame, found.ids, places, blur, refined, twist, track, decoder.cells)
         if bent:
-            scale = _shown_scale(frame, scale, markers, start, decoder)
+            gray_scale = _shown_scale(frame, gray_scale, markers, start, decoder)
         change = np.abs(markers.corners.corners_px - refined.corners_px + blur.shift)
-        settled = change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX and not (bent and scale.differs(before))
+        settled = change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX and not (bent and gray_scale.differs(before))
         if markers.twist is None or settled:
             break
         twist, places, rough = markers.twist, markers.places, np.zeros_like(rough)
     if bent:
-        scale = scale._replace(settled=not scale.differs(of_last))
-    return markers, scale
+        gray_scale = gray_scale._replace(settled=not gray_scale.differs(of_last))
+    return markers, gray_scale
 
 
 def _shown_scale(

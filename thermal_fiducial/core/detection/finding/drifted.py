@@ -47,7 +47,7 @@ def drifted_markers(
     flow: FloatArray,
     of_camera: FloatArray,
     farthest_px: float,
-    kinds: tuple[float, ...],
+    polarities: tuple[float, ...],
     decoder: Decoder,
 ) -> tuple[BoolArray, FloatArray]:
     """Which of N markers the image shows away from their predictions, and where.
@@ -59,7 +59,7 @@ def drifted_markers(
     flow : (N, 2, 6) derivative of their centres by a displacement of the camera in its axes, position first [px/m, rad]
     of_camera : (6, 6) covariance of that displacement
     farthest_px : largest distance that is searched
-    kinds : polarities, 1 for markers darker than their surroundings, -1 for brighter
+    polarities : 1 for markers darker than their surroundings, -1 for brighter
 
     Returns
     -------
@@ -73,7 +73,7 @@ def drifted_markers(
     for _ in range(halvings(cells.max())):
         images.append(halved(images[-1]))
     views = zip(ids.tolist(), corners, reach, strict=True)
-    templates = [MarkerTemplate(images, *view, kinds, decoder) for view in views]
+    templates = [MarkerTemplate(images, *view, polarities, decoder) for view in views]
     alone = [template.best(np.zeros(2), near) for template, near in zip(templates, reach, strict=True)]
     variances = (_OF_MATCH * cells) ** 2
     likely = [place for place, match in enumerate(alone) if match.gain > 0.0]
@@ -137,7 +137,7 @@ class MarkerTemplate:
     images : the image, and those of half the resolution of the one before, as many as :func:`halvings` says
     marker_id, corners : its ID, and (4, 2) as predicted [px]
     reach_px : (2,) how far it is looked for along columns and rows [px]
-    kinds : polarities, 1 for markers darker than their surroundings, -1 for brighter
+    polarities : 1 for markers darker than their surroundings, -1 for brighter
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class MarkerTemplate:
         marker_id: int,
         corners: FloatArray,
         reach_px: FloatArray,
-        kinds: tuple[float, ...],
+        polarities: tuple[float, ...],
         decoder: Decoder,
     ) -> None:
         cell = float(sides_px(corners[None])[0]) / decoder.cells
@@ -165,7 +165,7 @@ class MarkerTemplate:
             # Small numbers for sums in single precision.
             alike = cv2.matchTemplate(window - window.mean(), template, cv2.TM_CCOEFF_NORMED, mask=weights)
             alike = np.nan_to_num(alike, nan=0.0, posinf=0.0, neginf=0.0)
-            self._similarity = np.max([kind * alike for kind in kinds], axis=0)
+            self._similarity = np.max([polarity * alike for polarity in polarities], axis=0)
 
     def best(self, shift_px: FloatArray, reach_px: FloatArray) -> Match:
         """The best match at shifts that are no farther than ``reach_px`` (2,) from ``shift_px`` (2,)."""

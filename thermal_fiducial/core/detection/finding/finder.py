@@ -167,9 +167,9 @@ class MarkerFinder:
         config: ArucoDetectorConfig,
     ) -> FoundMarkers:
         """Markers by blind search, except those already ``found``."""
-        kinds, allowed = history.polarities(config.polarity), self.allowed(known, config)
-        blind = self._search.search(frame, allowed, config, found, scales, kinds)
-        possible = (blind.cnr[:, None] * kinds > 0.0).any(axis=1)
+        polarities, allowed = history.polarities(config.polarity), self.allowed(known, config)
+        blind = self._search.search(frame, allowed, config, found, scales, polarities)
+        possible = (blind.cnr[:, None] * polarities > 0.0).any(axis=1)
         ids, corners = blind.ids[possible], blind.corners_px[possible]
         at, sizes = ImagePoints.at(corners, frame.camera), known.sizes[ids]
         depth = depths(ippe_square(at.x, sizes)[:, 0], sizes)
@@ -251,12 +251,12 @@ def followed(
     if len(last.ids) == 0:
         return FoundMarkers.none()
     shown = places.at.px + places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
-    likeness = decoder.likeness(frame.pixels, shown)
-    similarity = likeness.correlation * np.sign(last.cnr)
-    alike = (likeness.best == 4 * last.ids) & (similarity > _STILL_SIMILAR)
+    match = decoder.best_match(frame.pixels, shown)
+    similarity = match.correlation * np.sign(last.cnr)
+    alike = (match.best == 4 * last.ids) & (similarity > _STILL_SIMILAR)
     alike &= (frame.camera.contains(shown) & frame.camera.shows(shown)).all(axis=1)
     certain = similarity >= config.guided_min_correlation
-    certain &= similarity - likeness.runner_up >= config.guided_min_margin
+    certain &= similarity - match.runner_up >= config.guided_min_margin
     found = FoundMarkers(last.ids, places, last.cnr, np.ones(len(alike), dtype=bool), certain)
     return found if alike.all() else found.only(alike)
 
@@ -287,5 +287,5 @@ def _shifted(image: Float32Array, ids: IntArray, corners: FloatArray, decoder: D
     cell = diagonals(corners) / (np.sqrt(2.0) * decoder.cells)
     step = cell[:, None, None] * NEAR_CELLS
     tried = (corners[:, None] + step[:, :, None]).reshape(-1, 4, 2)
-    similarity = np.abs(decoder.match(image, tried, np.repeat(ids, len(NEAR_CELLS)))).reshape(len(ids), -1)
+    similarity = np.abs(decoder.correlation(image, tried, np.repeat(ids, len(NEAR_CELLS)))).reshape(len(ids), -1)
     return np.asarray(corners + most_similar(similarity, step)[:, None])

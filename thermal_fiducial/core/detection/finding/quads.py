@@ -56,7 +56,7 @@ def halfway(places: FloatArray) -> FloatArray:
     return 0.5 * (places - 0.5)
 
 
-class Scale(NamedTuple):
+class Segmentation(NamedTuple):
     """Parameters of the segmentation at one resolution."""
 
     #: standard deviation of the Gaussian before the search [px]
@@ -78,8 +78,8 @@ class DarkRegions:
     The images of a frame are kept for the next one: fresh memory takes as long as what is computed in it.
     """
 
-    def __init__(self, scale: Scale) -> None:
-        self._scale = scale
+    def __init__(self, segmentation: Segmentation) -> None:
+        self._segmentation = segmentation
         self._smooth: _Image | None = None
         self._limit: _Image | None = None
         self._mask: _Image | None = None
@@ -93,18 +93,18 @@ class DarkRegions:
         noise : standard deviation of the noise of a pixel [counts]
         clear : whether all markers have a high contrast: less noise is followed then, and faint markers are missed
         """
-        scale, size = self._scale, counts.shape[::-1]
-        reach = 2 * round(2.5 * scale.smoothing_px) + 1
-        self._smooth = cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px, dst=self._smooth)
-        coarse = counts if scale.window_shrink == 1 else _smaller(counts)
-        window = scale.window_px, scale.window_px
-        limit = cv2.blur(self._smooth if scale.window_shrink == 1 else coarse, window)
+        segmentation, size = self._segmentation, counts.shape[::-1]
+        reach = 2 * round(2.5 * segmentation.smoothing_px) + 1
+        self._smooth = cv2.GaussianBlur(counts, (reach, reach), segmentation.smoothing_px, dst=self._smooth)
+        coarse = counts if segmentation.window_shrink == 1 else _smaller(counts)
+        window = segmentation.window_px, segmentation.window_px
+        limit = cv2.blur(self._smooth if segmentation.window_shrink == 1 else coarse, window)
         small = _smaller(coarse)
-        most = (_MOST_OF_CLEAR if clear else scale.most) * noise
+        most = (_MOST_OF_CLEAR if clear else segmentation.most) * noise
         deviation = np.minimum(cv2.absdiff(small, cv2.blur(small, (_LOCAL, _LOCAL))), most)
         spread = np.maximum(_STD_OF_MEAN * cv2.blur(deviation, (_LOCAL, _LOCAL)), TINY)
-        floor = (_FLOOR_OF_CLEAR if clear else scale.floor) * noise
-        asked = scale.depth * (spread + floor * floor / spread)
+        floor = (_FLOOR_OF_CLEAR if clear else segmentation.floor) * noise
+        asked = segmentation.depth * (spread + floor * floor / spread)
         cv2.subtract(limit, cv2.resize(asked, limit.shape[::-1], interpolation=cv2.INTER_LINEAR), dst=limit)
         if limit.shape != counts.shape:
             limit = self._limit = cv2.resize(limit, size, dst=self._limit, interpolation=cv2.INTER_LINEAR)

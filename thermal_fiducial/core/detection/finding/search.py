@@ -15,7 +15,7 @@ from thermal_fiducial.core.detection.finding.quads import (
     find_quads,
     halfway,
     halved,
-    Scale,
+    Segmentation,
 )
 from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
 from thermal_fiducial.core.detection.prediction.frame import Frame
@@ -24,8 +24,8 @@ from thermal_fiducial.core.geometry.reprojection import diagonals, grown, sides_
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.
-_FINE = Scale(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5, most=60.0)
-_FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0, most=40.0)
+_FINE = Segmentation(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5, most=60.0)
+_FAINT = Segmentation(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0, most=40.0)
 # Deviation from the background at which counts are clipped, in standard deviations of the noise at half resolution.
 _RANGE = 20.0
 # Correlation from which an outline needs no alignment; least correlation, and its margin, for alignment to be tried.
@@ -80,7 +80,7 @@ class BlindSearch:
         config: ArucoDetectorConfig,
         found: FoundMarkers,
         scales: SearchScales = SearchScales.ALL,
-        kinds: tuple[float, ...] = (1.0, -1.0),
+        polarities: tuple[float, ...] = (1.0, -1.0),
     ) -> Outlines:
         """Markers with IDs ``allowed`` (M,), each ID once.
 
@@ -88,7 +88,7 @@ class BlindSearch:
         ----------
         found : markers found already: they and their plates are left out of the search
         scales : resolutions of the search
-        kinds : polarities searched at half resolution, 1 for markers darker than their surroundings, -1 for brighter
+        polarities : those searched at half resolution, 1 for markers darker than their surroundings, -1 for brighter
         """
         # The plate, and as much again for its blurred edge.
         hidden = grown(found.places.at.px, (self._decoder.cells + 4) / self._decoder.cells)
@@ -102,7 +102,10 @@ class BlindSearch:
         if SearchScales.FAINT in scales:
             half = with_columns_corrected(halved(frame.image), 0.5 * frame.noise)
             near = about_background(half, 0.5 * _RANGE * frame.noise) if SearchScales.CLIPPED in scales else half
-            masks = (self._faint.mask(near if kind > 0.0 else -near, 0.5 * frame.noise, clear=clear) for kind in kinds)
+            masks = (
+                self._faint.mask(near if polarity > 0.0 else -near, 0.5 * frame.noise, clear=clear)
+                for polarity in polarities
+            )
             outlines = [find_quads(mask, 0.5 * config.min_side_px + 2.0, halfway(hidden)) for mask in masks]
             faint = 2.0 * np.concatenate(outlines) + 0.5
         # A search at full resolution alone is for clear markers, which need no alignment.

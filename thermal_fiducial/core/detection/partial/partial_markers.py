@@ -84,7 +84,7 @@ class PartialMarkerSearch:
     def look(
         self,
         frame: Frame,
-        scale: GrayScale,
+        gray_scale: GrayScale,
         candidates: list[tuple[int, FloatArray, float]],
         unsure_m: float,
         config: ArucoDetectorConfig,
@@ -95,13 +95,13 @@ class PartialMarkerSearch:
         ----------
         frame : whose twist is known
         candidates : of :meth:`KnownMarkers.partially_visible`
-        scale : of the display, as far as whole markers have shown it; counts have none
+        gray_scale : of the display, as far as whole markers have shown it; counts have none
         unsure_m : standard deviation of the predicted camera position [m]
         """
         in_view = (self._expected(frame.camera, key, size, T, unsure_m) for key, T, size in candidates)
         largest = sorted((marker for marker in in_view if marker is not None), key=lambda marker: -marker.cell_px)
         if frame.displayed and largest:
-            frame = frame.in_counts(scale.counts)
+            frame = frame.in_counts(gray_scale.counts)
         ids, found = list[int](), RefinedCorners.none()
         for marker in largest[:_MOST]:
             corners = self._one(frame, marker, config)
@@ -158,7 +158,7 @@ class PartialMarkerSearch:
         px = layer.project(se3.apply(marker.T_camera_marker, points))
 
         def similar(places: FloatArray) -> FloatArray:
-            return np.abs(self._visible.match(layer.image, px + places[:, None], marker.id))
+            return np.abs(self._visible.correlation(layer.image, px + places[:, None], marker.id))
 
         at, near = np.zeros(2), cell_px * NEAR_CELLS
         similarity = similar(near)
@@ -177,7 +177,7 @@ class PartialMarkerSearch:
     def _contrast(self, rough: PoseFit, marker: _PartialMarker, layer: Layer) -> float:
         """Contrast [counts] of the marker at a pose; 0 where the visible cells do not show its pattern."""
         places = se3.apply(rough.T_camera_marker, on_marker(self._visible.places, marker.size))
-        (correlation,) = self._visible.match(layer.image, layer.project(places)[None], marker.id).tolist()
+        (correlation,) = self._visible.correlation(layer.image, layer.project(places)[None], marker.id).tolist()
         return rough.contrast * np.sign(correlation) if abs(correlation) >= _ALIKE else 0.0
 
 

@@ -38,7 +38,7 @@ class VisibleCells:
         #: (9 C, 2) shares of the sides at which the C cells are sampled, nine times each
         self.places = np.stack([a, b], axis=-1).reshape(-1, 2)[order]
 
-    def match(self, image: Float32Array, px: FloatArray, marker_id: int) -> FloatArray:
+    def correlation(self, image: Float32Array, px: FloatArray, marker_id: int) -> FloatArray:
         """Correlation (O,) of cells whose samples are at pixels (O, 9 C, 2) with the upright pattern of a marker.
 
         An even slope is taken out of both. Where too few steps or too little of the pattern are visible, it is 0.
