@@ -53,8 +53,8 @@ def confirmed(
 ) -> RefinedMarkers:
     """The markers ``found`` that show their pattern at the refined corners and are squares."""
     corners = markers.observed.corners_px
-    there = found.places.at.px + markers.blur.shift
-    off_cells = np.abs(corners - there).max(axis=(1, 2)) * decoder.cells / sides_px(there)
+    predicted = found.places.points.px + markers.blur.shift
+    off_cells = np.abs(corners - predicted).max(axis=(1, 2)) * decoder.cells / sides_px(predicted)
     keep = ((off_cells < _LITTLE) & found.certain) | markers.observed.evident
     others = np.flatnonzero(~keep & ~markers.observed.refuted)
     if len(others):
@@ -69,15 +69,15 @@ def confirmed(
     return markers if keep.all() else markers.only(keep)
 
 
-def _square(at: ImagePoints, variance: FloatArray, cells: int) -> BoolArray:
+def _square(corners: ImagePoints, variance: FloatArray, cells: int) -> BoolArray:
     """Which outlines (N, 4), with corners of a ``variance`` (N,) [px^2], are about those of squares in space.
 
     The constraints of :mod:`corners.squares` measure no distance in the image: a tilt hardly changes a small square, so
     that corners 0.3 px off miss them by 0.1, or 6 px in a side of 60.
     """
-    count = len(at.px)
-    poses = planar_poses(at, np.tile(np.eye(2), (count, 4, 1, 1)), np.ones(count))
-    off_square = _OFF_SQUARE_CELLS / cells * sides_px(at.px)
+    count = len(corners.px)
+    poses = planar_poses(corners, np.tile(np.eye(2), (count, 4, 1, 1)), np.ones(count))
+    off_square = _OFF_SQUARE_CELLS / cells * sides_px(corners.px)
     return np.asarray(poses.rms_px[:, 0] ** 2 <= off_square**2 + _SIGMAS**2 * variance)
 
 

@@ -107,18 +107,18 @@ class MarkerDetector:
             again, other_scale = self._refined(unmoved, found, history)
             if len(again.ids):
                 frame, guide, T_camera_map, refined, gray_scale = unmoved, None, None, again, other_scale
-        ids, corners, at = refined.ids, refined.corners, refined.places.at
-        poses = self._poses(ids, corners.covariances, at, T_camera_map)
+        ids, corners, points = refined.ids, refined.corners, refined.places.points
+        poses = self._poses(ids, corners.covariances, points, T_camera_map)
         if config.plate_thickness > 0.0:
-            at = corners_of_faces(at, poses.T_camera_marker[:, 0], known.sizes[ids], config.plate_thickness)
-            poses = self._poses(ids, corners.covariances, at, T_camera_map)
-        rows = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
+            points = corners_of_faces(points, poses.T_camera_marker[:, 0], known.sizes[ids], config.plate_thickness)
+            poses = self._poses(ids, corners.covariances, points, T_camera_map)
+        rows = marker_rows(ids, points.px, corners.covariances, poses, corners.contrast)
         if guide is not None and among(ids, known.ids).sum() < _ENOUGH_WHOLE:
             rows = self._with_partial(rows, frame, gray_scale, guide)
         # A twist by corners of which none was confirmed as a marker's is dropped.
         twist = refined.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], known.sizes[ids])
-        markers = ExpectedMarkers(ids, refined.places.at.x, depth, corners.contrast / frame.noise)
+        markers = ExpectedMarkers(ids, refined.places.points.x, depth, corners.contrast / frame.noise)
         self._history = history.after(stamp_ns, twist, markers, gray_scale, saw_partial=len(rows) > len(ids))
         return rows
 
@@ -128,12 +128,12 @@ class MarkerDetector:
         return confirmed(frame, found, refined, self._decoder, self.config), gray_scale
 
     def _poses(
-        self, ids: IntArray, covariances: FloatArray, at: ImagePoints, T_camera_map: FloatArray | None
+        self, ids: IntArray, covariances: FloatArray, points: ImagePoints, T_camera_map: FloatArray | None
     ) -> PlanarPoses:
         """Both planar poses of each marker, the likelier first."""
         sizes = self._known.sizes[ids]
-        poses = planar_poses(at, covariances, sizes)
-        return choose_branches(poses, at, covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
+        poses = planar_poses(points, covariances, sizes)
+        return choose_branches(poses, points, covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
 
     def _with_partial(self, rows: Markers, frame: Frame, gray_scale: GrayScale, guide: Guide) -> Markers:
         """The rows of whole markers, and those of known ones that are partially visible from the ``guide``."""
@@ -143,9 +143,9 @@ class MarkerDetector:
         ids, corners = self._partial.look(frame, gray_scale, candidates, position_std_m, self.config)
         if len(ids) == 0:
             return rows
-        at = ImagePoints.at(corners.corners_px, frame.camera)
-        poses = self._poses(ids, corners.covariances, at, guide.T_camera_map)
-        partial = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
+        points = ImagePoints.at(corners.corners_px, frame.camera)
+        poses = self._poses(ids, corners.covariances, points, guide.T_camera_map)
+        partial = marker_rows(ids, points.px, corners.covariances, poses, corners.contrast)
         rows = np.concatenate([rows, partial])
         return np.asarray(rows[np.argsort(rows['id'], kind='stable')])
 

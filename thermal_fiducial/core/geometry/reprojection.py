@@ -163,7 +163,9 @@ def perspective(c: FloatArray) -> FloatArray:
     return np.asarray(triangle)
 
 
-def corners_of_faces(at: ImagePoints, T_camera_marker: FloatArray, sizes: FloatArray, thickness: float) -> ImagePoints:
+def corners_of_faces(
+    points: ImagePoints, T_camera_marker: FloatArray, sizes: FloatArray, thickness: float
+) -> ImagePoints:
     """Corners of the faces of N markers in plates of some thickness.
 
     From the side, outlines are larger than faces, and those of holes smaller: the cut sides of a plate are as cold as
@@ -173,17 +175,17 @@ def corners_of_faces(at: ImagePoints, T_camera_marker: FloatArray, sizes: FloatA
 
     Parameters
     ----------
-    at : (N, 4) corners of the outlines
+    points : (N, 4) corners of the outlines
     T_camera_marker : (N, 4, 4) poses by these outlines; those that are not finite change nothing
     sizes : (N,) sides of the faces [m]
     thickness : of all plates [m]
     """
     faces = marker_corners(sizes)
     outlines = outlines_on_faces(faces, np.sign(faces[..., :2]), inverse(T_camera_marker)[:, :3, 3], thickness)
-    face, outline = (apply(T_camera_marker, points) for points in (faces, outlines))
+    face, outline = (apply(T_camera_marker, edges) for edges in (faces, outlines))
     wider = outline[..., :2] / outline[..., 2:] - face[..., :2] / face[..., 2:]
-    beyond_px = (at.J @ wider[..., None])[..., 0]
-    return at.at_pixels(at.px - np.where(np.isfinite(beyond_px), beyond_px, 0.0))
+    beyond_px = (points.J @ wider[..., None])[..., 0]
+    return points.at_pixels(points.px - np.where(np.isfinite(beyond_px), beyond_px, 0.0))
 
 
 def outlines_on_faces(edges: FloatArray, outward: FloatArray, camera: FloatArray, thickness: float) -> FloatArray:

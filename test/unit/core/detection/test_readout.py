@@ -65,7 +65,7 @@ def rows_read(corners):
 def test_corners_are_found_where_their_rows_show_them():
     corners = points()
     places, seen = places_of(corners), rows_read(corners)
-    off = seen - places.at.px
+    off = seen - places.points.px
     assert np.abs(off).max() > 5.0
     # 0.003 px is what the third order leaves, 0.06 px would be what the bent ways do.
     np.testing.assert_allclose(rolling_displacement(places, TWIST, FRAME, seen[..., 1]), off, atol=0.01)
@@ -78,10 +78,10 @@ def test_nothing_moves_when_all_rows_are_read_at_once():
     for result in (
         rolling_displacement(places, TWIST, at_once),
         rolling_displacement(places, None, FRAME),
-        rolling_displacement(places, TWIST, at_once, places.at.px[..., 1]),
-        rolling_displacement(places, None, FRAME, places.at.px[..., 1]),
+        rolling_displacement(places, TWIST, at_once, places.points.px[..., 1]),
+        rolling_displacement(places, None, FRAME, places.points.px[..., 1]),
     ):
-        np.testing.assert_array_equal(result, np.zeros_like(places.at.px))
+        np.testing.assert_array_equal(result, np.zeros_like(places.points.px))
 
 
 @pytest.mark.parametrize('lag', [0.0005, 0.010])

@@ -311,7 +311,7 @@ def test_large_markers_off_their_predictions_are_found_where_their_sides_are(cel
         found = near(image, marker_id, corners + cell * np.array(off))
         assert found.ids.tolist() == [marker_id]
         # 1.2 px at most when written; up to 13 px before.
-        assert np.abs(found.places.at.px[0] - corners).max() < FOUND_FROM_PX
+        assert np.abs(found.places.points.px[0] - corners).max() < FOUND_FROM_PX
 
 
 @pytest.mark.parametrize('corner', [0, 2])
@@ -326,7 +326,7 @@ def test_what_covers_a_corner_of_a_large_marker_does_not_draw_it_there(cell, rad
         found = near(image, marker_id, corners + 0.1 * cell * np.array([1.0, -1.0]))
         assert found.ids.tolist() == [marker_id]
         # 1.8 px at most when written; up to 20 px before.
-        assert np.abs(found.places.at.px[0] - corners).max() < FOUND_FROM_PX
+        assert np.abs(found.places.points.px[0] - corners).max() < FOUND_FROM_PX
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])

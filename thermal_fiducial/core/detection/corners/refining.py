@@ -94,7 +94,7 @@ def refine(
     rough = ~found.certain
     for _ in range(_ROUNDS_ON_DISPLAYS if frame.displayed else _ROUNDS):
         blur, before = motion_blur(frame, places, twist), gray_scale
-        start = places.at.at_pixels(places.at.px + blur.shift)
+        start = places.points.at_pixels(places.points.px + blur.shift)
         bent = frame.displayed and blur.to_tails is not None
         shown = frame.in_counts(gray_scale.counts) if bent else frame
         refined = _measured(shown, found, start, blur, columns, decoder, rough)
@@ -195,7 +195,7 @@ def _at_stamp(
     cells: int,
 ) -> RefinedMarkers:
     """Corners at the stamp, without lag and rolling shutter, by the twist that they correct."""
-    at = places.at.at_pixels(refined.corners_px - blur.shift)
+    at = places.points.at_pixels(refined.corners_px - blur.shift)
     deviation = np.sqrt(refined.mean_variance) / frame.camera.focal_px
     # Without a predicted twist, the first round measures one between two lagging frames, and the second must not again:
     # its corners are corrected for lag, those of the last frame are not.

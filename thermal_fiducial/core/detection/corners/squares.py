@@ -53,7 +53,7 @@ class Squared(NamedTuple):
         return np.asarray(together * blocks)
 
 
-def as_squares(at: ImagePoints, measured: FloatArray, covariance: FloatArray) -> Squared:
+def as_squares(corners: ImagePoints, measured: FloatArray, covariance: FloatArray) -> Squared:
     """Displacements of corners with the constraint of a square.
 
     Two planar poses of a small square look almost alike. The one nearer to the initial corners, translated, is taken
@@ -61,36 +61,42 @@ def as_squares(at: ImagePoints, measured: FloatArray, covariance: FloatArray) ->
 
     Parameters
     ----------
-    at : (N, 4) initial corners, without what a rolling shutter displaces them by: lag hardly changes the shape of a
+    corners : (N, 4) initial ones, without what a rolling shutter displaces them by: lag hardly changes the shape of a
         square
     measured, covariance : (N, 8, 1), (N, 8, 8) displacements of the corners [px]
     """
-    nearest = _corrected(at, _TOGETHER @ measured, measured, covariance)
+    nearest = _corrected(corners, _TOGETHER @ measured, measured, covariance)
     # Linearised away from a square, the constraints miss that they fold where small squares are viewed from in front.
     # Both poses of the measured corners are squares to begin at.
     for pose in (None, 0, 1):
         refuted = np.flatnonzero(nearest.chi2 > _INCONSISTENT)
         if len(refuted) == 0:
             break
-        points, off = at.only(refuted), measured[refuted]
-        other = _corrected(points, off if pose is None else _square_of(points, off, pose), off, covariance[refuted])
+        initial, off = corners.only(refuted), measured[refuted]
+        begin = off if pose is None else _square_of(initial, off, pose)
+        other = _corrected(initial, begin, off, covariance[refuted])
         better = other.chi2 < nearest.chi2[refuted]
-        for mine, its in zip(nearest, other, strict=True):
-            mine[refuted[better]] = its[better]
+        for kept, new in zip(nearest, other, strict=True):
+            kept[refuted[better]] = new[better]
     return nearest
 
 
-def _square_of(at: ImagePoints, measured: FloatArray, pose: int) -> FloatArray:
+def _square_of(corners: ImagePoints, measured: FloatArray, pose: int) -> FloatArray:
     """Displacements (N, 8, 1) to the squares in one of the two planar poses of the measured corners [px]."""
-    T = ippe_square(at.x + (at.inverse @ measured.reshape(-1, 4, 2, 1))[..., 0], np.ones(len(measured)))[:, pose]
-    corners = apply(T, marker_corners(1.0))
-    return np.asarray(at.J @ (corners[..., :2] / corners[..., 2:] - at.x)[..., None]).reshape(-1, 8, 1)
+    T = ippe_square(_displaced(corners, measured), np.ones(len(measured)))[:, pose]
+    square = apply(T, marker_corners(1.0))
+    return np.asarray(corners.J @ (square[..., :2] / square[..., 2:] - corners.x)[..., None]).reshape(-1, 8, 1)
 
 
-def _corrected(at: ImagePoints, moved: FloatArray, measured: FloatArray, covariance: FloatArray) -> Squared:
+def _displaced(corners: ImagePoints, px: FloatArray) -> FloatArray:
+    """Normalised corners (N, 4, 2) after displacements (N, 8, 1) [px]."""
+    return np.asarray(corners.x + (corners.inverse @ px.reshape(-1, 4, 2, 1))[..., 0])
+
+
+def _corrected(corners: ImagePoints, moved: FloatArray, measured: FloatArray, covariance: FloatArray) -> Squared:
     """Update of an iterated Kalman filter, linearised first at the displacements ``moved`` (N, 8, 1)."""
     for _ in range(_STEPS):
-        value, J = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
+        value, J = squareness(_displaced(corners, moved), corners.inverse)
         error = value + J @ (measured - moved)
         spread = covariance @ J.swapaxes(1, 2)
         variance = SQUARE_STD**2 + (_BENT * value) ** 2

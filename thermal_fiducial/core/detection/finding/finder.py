@@ -15,7 +15,7 @@ from thermal_fiducial.core.detection.corners.refining import CLEAR_CNR
 from thermal_fiducial.core.detection.finding.drifted import drifted_markers
 from thermal_fiducial.core.detection.finding.search import BlindSearch, large_aligned, SearchScales
 from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
-from thermal_fiducial.core.detection.prediction.frame import Frame, Places, rolling_displacement
+from thermal_fiducial.core.detection.prediction.frame import displacement_by_motion, Frame, Places, rolling_displacement
 from thermal_fiducial.core.detection.prediction.known_markers import (
     among,
     CUT_OFF_PX,
@@ -70,7 +70,6 @@ class FrameHistory:
     ) -> 'FrameHistory':
         """The history that the frame after one with these starts from."""
         track = self.track.after(stamp_ns, twist, markers)
-        # Of dark over bright markers.
         surplus, before_ns = float(np.sign(markers.cnr).sum()), self.track.stamp_ns
         if surplus != 0.0:
             balance = min(max(self.balance * (1.0 - 1.0 / _FRAMES) + surplus, -_FRAMES), _FRAMES)
@@ -84,7 +83,7 @@ class FrameHistory:
         return self.searched_ns is not None and 0 <= stamp_ns - self.searched_ns < seconds * SECOND_NS
 
     def polarities(self, rule: str) -> tuple[float, ...]:
-        """Possible ones by the parameter ``polarity``: 1 for markers darker than their background, -1."""
+        """Possible ones by the parameter ``polarity``: 1 for markers darker than their background, -1 for brighter."""
         if rule == 'any' or (rule == 'alike' and abs(self.balance) < _SURE):
             return 1.0, -1.0
         return (math.copysign(1.0, self.balance) if rule == 'alike' else 1.0 if rule == 'dark' else -1.0,)
@@ -109,21 +108,21 @@ class MarkerFinder:
 
         ``guide``: camera by which the map's markers are predicted; None: they are not.
         """
-        in_map: ExpectedMarkers | None = None
+        unfollowed: ExpectedMarkers | None = None
         if frame.twist is None or not config.guided:
             found, complete, holds = FoundMarkers.none(), False, False
         else:
-            found, number, in_map = self._guided(frame, history, known, guide, config)
-            complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
-            enough = complete or (number > 0 and len(found.ids) >= _ENOUGH * number)
-            holds = in_map is not None and enough
+            found, predictions, unfollowed = self._guided(frame, history, known, guide, config)
+            complete = len(found.ids) >= predictions and (predictions > 0 or history.saw_partial)
+            enough = complete or (predictions > 0 and len(found.ids) >= _ENOUGH * predictions)
+            holds = unfollowed is not None and enough
         period = config.blind_period if holds else min(config.blind_period, _UNSURE_S)
         if (complete or holds) and history.searched_within(frame.stamp_ns, period):
             return found, history
         scales = _next_scales(history, found, complete=complete)
-        found = found.and_elsewhere(self._blind(frame, history, found, scales, known, in_map, config))
-        if not holds and in_map is not None and guide is not None:
-            missing = in_map.only(~among(in_map.ids, found.ids))
+        found = found.and_elsewhere(self._blind(frame, history, found, scales, known, unfollowed, config))
+        if not holds and unfollowed is not None and guide is not None:
+            missing = unfollowed.only(~among(unfollowed.ids, found.ids))
             found = found.and_elsewhere(self._drifted(frame, missing, guide, history, config))
         return found, replace(history, searched_ns=frame.stamp_ns, scales=scales)
 
@@ -137,24 +136,27 @@ class MarkerFinder:
     ) -> tuple[FoundMarkers, int, ExpectedMarkers | None]:
         """Markers found at their predictions, from the last frame, else from the map.
 
-        And the number of predictions, and those from the map, of markers that could not be followed.
+        And the number of predictions, and those from the map, of markers that could not be followed from the last
+        frame; None without a ``guide``.
         """
         last = history.track.expected(frame.stamp_ns, frame.twist)
-        places = Places.of(ImagePoints.seen_at(last.x, frame.camera), last.depth)
-        wanted: BoolArray = np.asarray(frame.camera.contains(places.at.px, CUT_OFF_PX).all(axis=1))
+        places = last.places(frame.camera)
+        wanted: BoolArray = np.asarray(frame.camera.contains(places.points.px, CUT_OFF_PX).all(axis=1))
         if not wanted.all():
             last, places = last.only(wanted), places.only(wanted)
-        found, in_map = followed(frame, last, places, self._decoder, config), None
+        found, unfollowed = followed(frame, last, places, self._decoder, config), None
         lost, missing = ~among(last.ids, found.ids), ExpectedMarkers.none()
         if guide is not None:
-            missing = in_map = known.expected(guide.T_camera_map, frame.camera, config.min_side_px, without=found.ids)
+            missing = unfollowed = known.expected(
+                guide.T_camera_map, frame.camera, config.min_side_px, without=found.ids
+            )
             lost &= ~among(last.ids, known.ids)
         if lost.any():
             missing = missing.joined(last.only(lost))
-        number = len(found.ids) + len(missing.ids)
+        predictions = len(found.ids) + len(missing.ids)
         if len(missing.ids):
             found = found.and_elsewhere(near_prediction(frame, missing, self._decoder, config))
-        return found, number, in_map
+        return found, predictions, unfollowed
 
     def _blind(
         self,
@@ -163,7 +165,7 @@ class MarkerFinder:
         found: FoundMarkers,
         scales: SearchScales,
         known: KnownMarkers,
-        in_map: ExpectedMarkers | None,
+        unfollowed: ExpectedMarkers | None,
         config: ArucoDetectorConfig,
     ) -> FoundMarkers:
         """Markers by blind search, except those already ``found``."""
@@ -173,10 +175,10 @@ class MarkerFinder:
         ids, corners = blind.ids[possible], blind.corners_px[possible]
         at, sizes = ImagePoints.at(corners, frame.camera), known.sizes[ids]
         depth = depths(ippe_square(at.x, sizes)[:, 0], sizes)
-        if in_map is not None:
+        if unfollowed is not None:
             # A single marker's planar pose may be the wrong one, and with it depth and direction of the motion blur.
-            mapped, mine = np.nonzero(in_map.ids[:, None] == ids)
-            depth[mine] = in_map.depth[mapped]
+            predicted, here = np.nonzero(unfollowed.ids[:, None] == ids)
+            depth[here] = unfollowed.depth[predicted]
         places = Places.of(at, depth)
         if frame.readout != 0.0:
             # Places at the stamp, without the displacement by the rolling shutter.
@@ -194,18 +196,18 @@ class MarkerFinder:
         config: ArucoDetectorConfig,
     ) -> FoundMarkers:
         """Those of the ``missing`` markers that are together farther from their predictions by the ``guide``."""
-        places = Places.of(ImagePoints.seen_at(missing.x, frame.camera), missing.depth)
-        cells = sides_px(places.at.px) / self._decoder.cells
+        places = missing.places(frame.camera)
+        cells = sides_px(places.points.px) / self._decoder.cells
         # The widest ones are the most distinct.
         tried = np.argsort(-cells, kind='stable')[: min(_MOST, int((cells >= _LEAST_CELL_PX).sum()))]
         if len(tried) == 0:
             return FoundMarkers.none()
         missing, places = missing.only(tried), places.only(tried)
-        displaced = places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
-        shown, corners = drifted_markers(
+        displaced = displacement_by_motion(places, frame)
+        is_there, corners = drifted_markers(
             frame.image,
             missing.ids,
-            places.at.px + displaced,
+            places.points.px + displaced,
             places.flow.mean(axis=1),
             turned(guide.covariance, guide.T_camera_map[:3, :3]),
             _FARTHEST * frame.camera.width,
@@ -213,8 +215,8 @@ class MarkerFinder:
             self._decoder,
         )
         x = ImagePoints.at(corners - displaced, frame.camera).x
-        again = replace(missing, x=x).only(shown)
-        return near_prediction(frame, again, self._decoder, config) if shown.any() else FoundMarkers.none()
+        again = replace(missing, x=x).only(is_there)
+        return near_prediction(frame, again, self._decoder, config) if is_there.any() else FoundMarkers.none()
 
     def allowed(self, known: KnownMarkers, config: ArucoDetectorConfig) -> BoolArray:
         """Which IDs of the dictionary may be found: of those that show a pose."""
@@ -232,8 +234,8 @@ def _next_scales(history: FrameHistory, found: FoundMarkers, *, complete: bool) 
     Where none is ``found`` at its prediction, counts are clipped every other time until markers show: clipped ones show
     those that touch a flame or are beside a panel, others those in motion blur, both ends of which would be clipped.
     """
-    last, shown = history.scales, len(history.track.markers.ids) > 0
-    if len(found.ids) == 0 and (SearchScales.CLIPPED in last) == shown:
+    last, had_markers = history.scales, len(history.track.markers.ids) > 0
+    if len(found.ids) == 0 and (SearchScales.CLIPPED in last) == had_markers:
         return SearchScales.ALL | SearchScales.CLIPPED
     if not (complete and history.track.all_clearer_than(CLEAR_CNR)):
         return SearchScales.ALL
@@ -250,11 +252,11 @@ def followed(
     """Those of the ``last`` frame's N markers whose pattern the image shows at the predicted ``places``."""
     if len(last.ids) == 0:
         return FoundMarkers.none()
-    shown = places.at.px + places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
-    match = decoder.best_match(frame.pixels, shown)
+    corners = places.points.px + displacement_by_motion(places, frame)
+    match = decoder.best_match(frame.pixels, corners)
     similarity = match.correlation * np.sign(last.cnr)
     alike = (match.best == 4 * last.ids) & (similarity > _STILL_SIMILAR)
-    alike &= (frame.camera.contains(shown) & frame.camera.shows(shown)).all(axis=1)
+    alike &= (frame.camera.contains(corners) & frame.camera.shows(corners)).all(axis=1)
     certain = similarity >= config.guided_min_correlation
     certain &= similarity - match.runner_up >= config.guided_min_margin
     found = FoundMarkers(last.ids, places, last.cnr, np.ones(len(alike), dtype=bool), certain)
@@ -268,18 +270,17 @@ def near_prediction(
     config: ArucoDetectorConfig,
 ) -> FoundMarkers:
     """Those of the ``expected`` markers that are decoded near their predictions."""
-    places = Places.of(ImagePoints.seen_at(expected.x, frame.camera), expected.depth)
-    displaced = places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
-    ids = expected.ids
-    shown = _shifted(frame.image, ids, places.at.px + displaced, decoder)
-    shown = large_aligned(frame.image, shown, ids, decoder, predicted=True)
-    reading = decoder.read(frame.image, shown)
+    ids, places = expected.ids, expected.places(frame.camera)
+    displaced = displacement_by_motion(places, frame)
+    corners = _shifted(frame.image, ids, places.points.px + displaced, decoder)
+    corners = large_aligned(frame.image, corners, ids, decoder, predicted=True)
+    reading, at_stamp = decoder.read(frame.image, corners), corners - displaced
     limits = config.guided_min_correlation, config.guided_min_margin, config.guided_min_contrast * frame.noise
     good = (reading.ids == ids) & (reading.turns == 0) & reading.clear(*limits)
-    good &= frame.camera.shows(shown - displaced).all(axis=1)
-    at = ImagePoints.at((shown - displaced)[good], frame.camera)
-    places, no = Places.of(at, expected.depth[good]), np.zeros(len(at.px), dtype=bool)
-    return FoundMarkers(ids[good], places, reading.contrast[good] / frame.noise, ~no, no)
+    good &= frame.camera.shows(at_stamp).all(axis=1)
+    found = Places.of(ImagePoints.at(at_stamp[good], frame.camera), expected.depth[good])
+    no = np.zeros(len(found.depth), dtype=bool)
+    return FoundMarkers(ids[good], found, reading.contrast[good] / frame.noise, ~no, no)
 
 
 def _shifted(image: Float32Array, ids: IntArray, corners: FloatArray, decoder: Decoder) -> FloatArray:

@@ -91,7 +91,7 @@ class BlindSearch:
         polarities : those searched at half resolution, 1 for markers darker than their surroundings, -1 for brighter
         """
         # The plate, and as much again for its blurred edge.
-        hidden = grown(found.places.at.px, (self._decoder.cells + 4) / self._decoder.cells)
+        hidden = grown(found.places.points.px, (self._decoder.cells + 4) / self._decoder.cells)
         min_side_px, edge_px = config.min_side_px - _SHORTER_PX, _EDGE_PX
         if frame.displayed:
             min_side_px, edge_px = _PICTURE_SIDE * config.min_side_px, 0.0

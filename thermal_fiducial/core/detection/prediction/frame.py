@@ -163,21 +163,21 @@ class Saturation(NamedTuple):
 class Places(Stacked):
     """Image points of the corners (N, 4) of markers at a frame's stamp, with depth and optical flow."""
 
-    at: ImagePoints
+    points: ImagePoints
     #: (N, 4) [m]
     depth: FloatArray
     #: (N, 4, 2, 6) Jacobian of the image velocity by the camera's twist [px/s]
     flow: FloatArray
 
     @staticmethod
-    def of(at: ImagePoints, depth: FloatArray) -> 'Places':
+    def of(points: ImagePoints, depth: FloatArray) -> 'Places':
         """Places of image points (N, 4) at ``depth`` (N, 4)."""
-        return Places(at, depth, at.J @ interaction(at.x, depth))
+        return Places(points, depth, points.J @ interaction(points.x, depth))
 
     def lag_blur(self, twist: Twist | None, lag: float) -> FloatArray:
         """Mean displacement (N, 4, 2) [px] of the corners in a ``lag`` [s]; none by an unknown twist."""
         if twist is None:
-            return np.zeros_like(self.at.px)
+            return np.zeros_like(self.points.px)
         return np.asarray(-lag * (self.flow @ twist.ago(lag)))
 
 
@@ -194,14 +194,19 @@ def rolling_displacement(
     ``rows`` (N, 4): in which the corners were observed; None: those that they are in at the stamp, lag included.
     """
     if frame.readout == 0.0 or twist is None:
-        return np.zeros_like(places.at.px)
+        return np.zeros_like(places.points.px)
     if rows is None:
-        rows = (places.at.px + places.lag_blur(twist, frame.lag))[..., 1]
+        rows = (places.points.px + places.lag_blur(twist, frame.lag))[..., 1]
     later = delays(rows, frame)[..., None]
-    middle = places.at.x + 0.5 * later * (interaction(places.at.x, places.depth) @ twist.value)
+    middle = places.points.x + 0.5 * later * (interaction(places.points.x, places.depth) @ twist.value)
     flow = Places.of(ImagePoints.seen_at(middle, frame.camera), places.depth).flow
     # A lagging image moves with the velocity of one time constant ago.
     return np.asarray(later * (flow @ twist.value - (frame.lag - 0.5 * later) * (flow @ twist.acceleration)))
+
+
+def displacement_by_motion(places: Places, frame: Frame) -> FloatArray:
+    """Displacement (N, 4, 2) [px] of the corners in the image from their places at the stamp: lag, rolling shutter."""
+    return places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
 
 
 def counts_of(pixel: IntArray, image: Pixels, to_tails: FloatArray | None = None) -> Float32Array:
@@ -293,5 +298,5 @@ def motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlur
     if (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
         return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean, lag_blur)
     shift = REMAINING * lag_blur + rolling
-    to_tails = lag_tail_maps(places.at.px + shift, lag_blur)
+    to_tails = lag_tail_maps(places.points.px + shift, lag_blur)
     return MotionBlur(to_tails, shift, (1.0 - REMAINING) * lag_blur, SPREAD * mean, lag_blur)

@@ -45,6 +45,10 @@ class ExpectedMarkers(Stacked):
     depth: FloatArray
     cnr: FloatArray
 
+    def places(self, camera: Camera) -> Places:
+        """Where ``camera`` shows them at the stamp."""
+        return Places.of(ImagePoints.seen_at(self.x, camera), self.depth)
+
     @staticmethod
     def none() -> 'ExpectedMarkers':
         """No markers."""
@@ -81,8 +85,10 @@ class FoundMarkers(Stacked):
         """These markers and those of ``others`` with other IDs that do not overlap them."""
         if len(others.ids) == 0:
             return self
-        apart = np.linalg.norm(others.places.at.px.mean(axis=1)[:, None] - self.places.at.px.mean(axis=1), axis=-1)
-        extent = diagonals(self.places.at.px)
+        apart = np.linalg.norm(
+            others.places.points.px.mean(axis=1)[:, None] - self.places.points.px.mean(axis=1), axis=-1
+        )
+        extent = diagonals(self.places.points.px)
         return self.joined(others.only(~among(others.ids, self.ids) & (apart > TOGETHER * extent).all(axis=1)))
 
 
