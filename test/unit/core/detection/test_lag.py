@@ -216,7 +216,7 @@ def test_a_marker_in_motion_shows_the_gray_scale_of_a_display(cell, lag_blur, be
     view = PatternView(np.rint(200.0 * np.clip(image, 0.0, 1.0) ** bent).astype(np.float32))
     view, scale = view._replace(lag=np.broadcast_to(lag_blur, corners.shape)), UNKNOWN_SCALE
     for _ in range(3):
-        scale = scale.shown_by(view, corners + lag_blur, MARKER, decoder, BLUR_PX)
+        scale = scale.estimated_by(view, corners + lag_blur, MARKER, decoder, BLUR_PX)
     levels = np.arange(20, 181)
     true = (levels / 200.0) ** (1.0 / bent)
     zero_and_unit = np.polyfit(scale.counts[levels], true, 1)

@@ -394,8 +394,8 @@ def test_information_and_residuals_have_the_same_covariance():
     # Patches differ.
     rest += np.repeat(rng.normal(0.0, 3.0, (2, 49)), 9, axis=1).astype(np.float32) * (1.0 + pattern)
     shown, J = (grid.patches(values) for values in (pattern, rest, np.ones_like(rest))), np.stack(rows, axis=1)
-    uneven = Unevenness.shown(*shown, np.ones(2))
-    weighted = np.stack([uneven.left(grid.patches(row)).reshape(row.shape) for row in rows], axis=1)
+    uneven = Unevenness.estimated(*shown, np.ones(2))
+    weighted = np.stack([uneven.weighted(grid.patches(row)).reshape(row.shape) for row in rows], axis=1)
     # Rounding of single precision: 1e-5 of the information.
     np.testing.assert_allclose(products_of(J) - uneven.information(J), J @ weighted.swapaxes(1, 2), atol=5e-3)
     assert np.trace(uneven.information(J), axis1=1, axis2=2).min() > 100.0

@@ -56,7 +56,7 @@ class GrayScale(NamedTuple):
         left = math.sqrt(max(variance - common * common / (others_variance + TINY), 0.0))
         return left > (_MATTERS if before.settled else _MATTERS_AT_FIRST) * float(np.ptp(counts))
 
-    def shown_by(
+    def estimated_by(
         self, view: PatternView, corners_px: FloatArray, ids: IntArray, decoder: Decoder, blur_px: float
     ) -> 'GrayScale':
         """The gray scale that markers ``ids`` (N,) show where this one is known before.
@@ -80,8 +80,9 @@ class GrayScale(NamedTuple):
         for _ in range(_ROUNDS):
             counts = np.interp(gray, _LEVELS, scale.counts).astype(np.float32)
             rest = grid.patches(fitted(terms, products, (counts - counts[:, :1]) * known, None)[1])
-            left = Unevenness.shown(pattern, rest, grid.patches(known.astype(np.float32)), apart_px).left(rest)
-            scale = _by_means((counts - left.reshape(counts.shape))[known], gray[known], scale)
+            uneven = Unevenness.estimated(pattern, rest, grid.patches(known.astype(np.float32)), apart_px)
+            even_rest = uneven.weighted(rest).reshape(counts.shape)
+            scale = _by_means((counts - even_rest)[known], gray[known], scale)
         return scale._replace(settled=self.settled)
 
 

@@ -36,7 +36,7 @@ from thermal_fiducial.core.detection.corners.corner_errors import (
     RefinedCorners,
     SURFACE_FALLS,
 )
-from thermal_fiducial.core.detection.corners.pattern_residuals import linearised, PatternResiduals
+from thermal_fiducial.core.detection.corners.pattern_residuals import PatternResiduals, residuals_at
 from thermal_fiducial.core.detection.corners.side_fit import too_small_for_sides
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.detection.patterns import Decoder
@@ -113,24 +113,24 @@ class _Prior(NamedTuple):
     corners_std: FloatArray
     blur_px: float
 
-    def normal_equations(self, at: PatternResiduals) -> tuple[FloatArray, FloatArray]:
+    def normal_equations(self, residuals: PatternResiduals) -> tuple[FloatArray, FloatArray]:
         """With it, (Q, K, K), (Q, K, 1), for samples with a variance of 1."""
-        precision, off = self._precision(at), np.zeros(at.J.shape[:2])
-        off[:, CORNERS] = (at.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
-        off[:, BLUR], off[:, LINEAR][:, SMALL] = at.blur - self.blur_px, at.amounts[:, SMALL]
-        information = at.information.copy()
+        precision, off = self._precision(residuals), np.zeros(residuals.J.shape[:2])
+        off[:, CORNERS] = (residuals.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
+        off[:, BLUR], off[:, LINEAR][:, SMALL] = residuals.blur - self.blur_px, residuals.amounts[:, SMALL]
+        information = residuals.information.copy()
         np.einsum('qii->qi', information)[:] += precision
-        return _solvable(information), _gradient(at) + (precision * off)[..., None]
+        return _solvable(information), _gradient(residuals) + (precision * off)[..., None]
 
-    def _precision(self, at: PatternResiduals) -> FloatArray:
+    def _precision(self, residuals: PatternResiduals) -> FloatArray:
         """Inverse variances (Q, K), for samples with a variance of 1."""
-        precision = np.zeros(at.J.shape[:2])
+        precision = np.zeros(residuals.J.shape[:2])
         precision[:, CORNERS] = 1.0 / self.corners_std[:, None] ** 2
         precision[:, BLUR] = 1.0 / (_FOCUS * self.blur_px) ** 2
-        of_contrast = 1.0 / (at.contrast * at.contrast + TINY)
-        small = _SMALL_STD[at.unevenness is not None]
+        of_contrast = 1.0 / (residuals.contrast * residuals.contrast + TINY)
+        small = _SMALL_STD[residuals.unevenness is not None]
         precision[:, LINEAR][:, SMALL] = (1.0 / small) ** 2 * of_contrast[:, None]
-        return precision * _variance_of_samples(at, self.blur_px)[:, None]
+        return precision * _variance_of_samples(residuals, self.blur_px)[:, None]
 
 
 class PatternFit(NamedTuple):
@@ -200,28 +200,30 @@ def fit_patterns(
     grid = pattern_grid(decoder.cells, min(density, _MOST), nearer)
     prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
     blurs_px = blur_px if view.motion is None else np.hypot(blur_px, np.hypot(*view.motion.T))
-    at = linearised(view, quads.copy(), blur, white, grid)
+    residuals = residuals_at(view, quads.copy(), blur, white, grid)
     # Which samples are known changes with the corners.
-    alone = (widths(quads) > _ALONE * blurs_px * decoder.cells) & at.known.all(axis=1)
+    alone = (widths(quads) > _ALONE * blurs_px * decoder.cells) & residuals.known.all(axis=1)
     same_px, same_blur = (np.where(alone, _SAME_ALONE, same) for same in (_SAME_PX, _SAME_BLUR))
     converged_px, last = _CONVERGED_PX[view.displayed], np.full(len(quads), np.inf)
     for left in reversed(range(_STEPS)):
-        information, product = prior.normal_equations(at)
+        information, product = prior.normal_equations(residuals)
         move = _step(information, product)
-        quads, blur = _moved(at, move, blur_px)
-        step = np.abs(quads - at.corners_px).max(axis=(1, 2))
-        far = (step > same_px) | (np.abs(blur - at.blur) > same_blur * blur_px)
+        quads, blur = _moved(residuals, move, blur_px)
+        step = np.abs(quads - residuals.corners_px).max(axis=(1, 2))
+        far = (step > same_px) | (np.abs(blur - residuals.blur) > same_blur * blur_px)
         anew, again = np.flatnonzero(far), np.flatnonzero(~far & (step > converged_px) & (step < _SHORTER * last))
         last = step
         if left == 0 or not len(anew) + len(again):
             break
         if len(anew):
-            at.put(anew, linearised(view.only(anew), quads[anew], blur[anew], white[anew], grid))
+            residuals.put(anew, residuals_at(view.only(anew), quads[anew], blur[anew], white[anew], grid))
         if len(again):
-            at.sample_at(view, quads[again], again)
-    at = at.moved(move)
-    covariance = _covariance(at, information, blur_px)
-    return PatternFit(quads, covariance, at.contrast, np.sqrt(_noise_variance(at, blur_px)), step, at)
+            residuals.sample_at(view, quads[again], again)
+    residuals = residuals.moved(move)
+    covariance = _covariance(residuals, information, blur_px)
+    return PatternFit(
+        quads, covariance, residuals.contrast, np.sqrt(_noise_variance(residuals, blur_px)), step, residuals
+    )
 
 
 def aligned(
@@ -253,82 +255,84 @@ def aligned(
     start, blur = quads, _WIDE * cell
     wide = blur
     for _ in range(steps):
-        at = linearised(view, quads, blur, white, grid)
-        information, gradient = at.information, _gradient(at)
+        residuals = residuals_at(view, quads, blur, white, grid)
+        information, gradient = residuals.information, _gradient(residuals)
         if predicted:
-            _hold_shape(information, gradient, at, start, _SHAPE * cell)
+            _hold_shape(information, gradient, residuals, start, _SHAPE * cell)
         diagonal = np.einsum('qii->qi', information)
         diagonal *= 1.0 + _DAMPING
-        quads, blur = _moved(at, _step(_solvable(information), gradient), wide)
+        quads, blur = _moved(residuals, _step(_solvable(information), gradient), wide)
     return quads
 
 
 def _hold_shape(
-    information: FloatArray, gradient: FloatArray, at: PatternResiduals, start: FloatArray, std_px: FloatArray
+    information: FloatArray, gradient: FloatArray, residuals: PatternResiduals, start: FloatArray, std_px: FloatArray
 ) -> None:
     """Add to the normal equations (Q, K, K), (Q, K, 1) that outlines have the shapes of ``start`` (Q, 4, 2).
 
     Where the model misses a cell, it misses all of its samples. ``std_px`` (Q,): of the shapes.
     """
-    variance = _FEWEST**2 * (at.rest * at.rest).mean(axis=1, dtype=np.float64)
+    variance = _FEWEST**2 * (residuals.rest * residuals.rest).mean(axis=1, dtype=np.float64)
     precision = (variance / std_px**2)[:, None, None] * _WITHOUT_MEAN
-    off = (at.corners_px - start).swapaxes(1, 2).reshape(-1, 8, 1)
+    off = (residuals.corners_px - start).swapaxes(1, 2).reshape(-1, 8, 1)
     information[:, CORNERS, CORNERS] += precision
     gradient[:, CORNERS] += precision @ off
 
 
-def _noise_variance(at: PatternResiduals, blur_px: float) -> FloatArray:
+def _noise_variance(residuals: PatternResiduals, blur_px: float) -> FloatArray:
     """Variance (Q,) of a pixel about the model.
 
     Neighbouring pixels that the model misses, it misses together: as many residuals as there are independent values.
     """
-    independent = _independent(at, blur_px)
-    mean_square = (at.rest * at.weighted).sum(axis=1) / at.number
+    independent = _independent(residuals, blur_px)
+    mean_square = (residuals.rest * residuals.weighted).sum(axis=1) / residuals.number
     return np.asarray(mean_square * independent / np.maximum(independent - _PARAMETERS, 1.0))
 
 
-def _variance_of_samples(at: PatternResiduals, blur_px: float) -> FloatArray:
+def _variance_of_samples(residuals: PatternResiduals, blur_px: float) -> FloatArray:
     """Variance (Q,) that samples would have, were they independent and said as much as the pixels."""
-    return np.asarray(_noise_variance(at, blur_px) / at.apart_px**2)
+    return np.asarray(_noise_variance(residuals, blur_px) / residuals.apart_px**2)
 
 
-def _independent(at: PatternResiduals, blur_px: float) -> FloatArray:
+def _independent(residuals: PatternResiduals, blur_px: float) -> FloatArray:
     """Number (Q,) of independent values: pixels over what blur averages over, its noise-equivalent area."""
-    return np.asarray(at.pixels / (4.0 * math.pi * np.minimum(at.blur, blur_px) ** 2))
+    return np.asarray(residuals.pixels / (4.0 * math.pi * np.minimum(residuals.blur, blur_px) ** 2))
 
 
-def _covariance(at: PatternResiduals, information: FloatArray, blur_px: float) -> FloatArray:
+def _covariance(residuals: PatternResiduals, information: FloatArray, blur_px: float) -> FloatArray:
     """Covariance (Q, 8, 8) of the corners [px^2], by the ``information`` (Q, K, K) of samples with a variance of 1.
 
     Neighbouring pixels that the model misses, it misses together: within a blur, or within a patch if that is more,
     as behind smoke.
     """
     inverse: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    variance = np.maximum(_variance_of_samples(at, blur_px), _variance_by_patches(at, inverse))
+    variance = np.maximum(_variance_of_samples(residuals, blur_px), _variance_by_patches(residuals, inverse))
     covariance = inverse[:, CORNERS, CORNERS] * variance[:, None, None]
     # From u of all corners and v of all of them to u and v of each.
     return np.asarray(covariance.reshape(-1, 2, 4, 2, 4).transpose(0, 2, 1, 4, 3).reshape(-1, 8, 8))
 
 
-def _variance_by_patches(at: PatternResiduals, inverse: FloatArray) -> FloatArray:
+def _variance_by_patches(residuals: PatternResiduals, inverse: FloatArray) -> FloatArray:
     """Variance (Q,) that samples would have if each patch missed the model as a whole, independently of the others.
 
     The squares of what the residuals of single patches move the corners by are added (K.-Y. Liang, S. Zeger,
     "Longitudinal data analysis using generalized linear models", 1986). ``inverse`` (Q, K, K): of the information.
     """
-    by_patches = at.grid.patches(at.J).swapaxes(1, 2) @ at.grid.patches(at.weighted)[..., None]
+    by_patches = (
+        residuals.grid.patches(residuals.J).swapaxes(1, 2) @ residuals.grid.patches(residuals.weighted)[..., None]
+    )
     moved = inverse[:, CORNERS] @ by_patches[..., 0].swapaxes(1, 2)
     # So much of what patches miss is left by a fit of so many parameters.
-    left = 1.0 - (at.J.shape[1] - at.grid.background.shape[1]) / moved.shape[2]
+    left = 1.0 - (residuals.J.shape[1] - residuals.grid.background.shape[1]) / moved.shape[2]
     claimed = np.maximum(np.trace(inverse[:, CORNERS, CORNERS], axis1=1, axis2=2), TINY)
     return np.asarray((moved * moved).sum(axis=(1, 2)) / (left * claimed), dtype=np.float64)
 
 
-def _gradient(at: PatternResiduals) -> FloatArray:
+def _gradient(residuals: PatternResiduals) -> FloatArray:
     """Derivative (Q, K, 1) of half the sum of the squared residuals, which is least over all that is linear."""
-    gradient = np.zeros((*at.J.shape[:2], 1))
+    gradient = np.zeros((*residuals.J.shape[:2], 1))
     nonlinear = slice(LINEAR.start)
-    np.negative(at.J[:, nonlinear] @ at.weighted[..., None], out=gradient[:, nonlinear])
+    np.negative(residuals.J[:, nonlinear] @ residuals.weighted[..., None], out=gradient[:, nonlinear])
     return gradient
 
 
@@ -344,12 +348,12 @@ def _step(information: FloatArray, gradient: FloatArray) -> FloatArray:
     return np.asarray(-np.linalg.solve(information, gradient)[..., 0], dtype=np.float64)
 
 
-def _moved(at: PatternResiduals, step: FloatArray, blur_px: float | FloatArray) -> tuple[FloatArray, FloatArray]:
+def _moved(residuals: PatternResiduals, step: FloatArray, blur_px: float | FloatArray) -> tuple[FloatArray, FloatArray]:
     """Corners (Q, 4, 2) and blur (Q,) after a step (Q, K), which is limited."""
-    longest = _LONGEST * (at.apart_px / at.grid.apart)[:, None]
-    corners = at.corners_px + np.clip(step[:, CORNERS], -longest, longest).reshape(-1, 2, 4).swapaxes(1, 2)
+    longest = _LONGEST * (residuals.apart_px / residuals.grid.apart)[:, None]
+    corners = residuals.corners_px + np.clip(step[:, CORNERS], -longest, longest).reshape(-1, 2, 4).swapaxes(1, 2)
     wider = np.clip(step[:, BLUR], -_LONGEST_BLUR * blur_px, _LONGEST_BLUR * blur_px)
-    return corners, np.clip(at.blur + wider, _BLURS[0] * blur_px, _BLURS[1] * blur_px)
+    return corners, np.clip(residuals.blur + wider, _BLURS[0] * blur_px, _BLURS[1] * blur_px)
 
 
 def _verdicts(
@@ -369,47 +373,47 @@ def _verdicts(
 
 
 def evidence_of(
-    at: PatternResiduals, which: IntArray, ids: IntArray, decoder: Decoder, blur_px: float
+    residuals: PatternResiduals, which: IntArray, ids: IntArray, decoder: Decoder, blur_px: float
 ) -> tuple[FloatArray, FloatArray]:
     """Log-likelihood ratios (W,) over a square with other content, and over the likeliest other marker or turn."""
-    free = np.clip(_independent(at, blur_px)[which] - _OF_CHANCE, 0.0, (decoder.cells - 2) ** 2)
-    left = 1.0 - _explained(at, which, decoder)
+    free = np.clip(_independent(residuals, blur_px)[which] - _OF_CHANCE, 0.0, (decoder.cells - 2) ** 2)
+    left = 1.0 - _explained(residuals, which, decoder)
     mine = np.arange(len(which)), 4 * ids[which]
     own = np.maximum(left[mine], _LEAST)
     left[mine] = 1.0
     other = np.maximum(left.min(axis=1), _LEAST)
-    content = np.maximum(_content(at, decoder.cells)[which], _LEAST)
+    content = np.maximum(_content(residuals, decoder.cells)[which], _LEAST)
     return 0.5 * free * np.log(content / own), 0.5 * free * np.log(other / own)
 
 
-def _content(at: PatternResiduals, cells: int) -> FloatArray:
+def _content(residuals: PatternResiduals, cells: int) -> FloatArray:
     """Share (Q,) of the variance that a border around a plain square, each of any gray, leaves: that of the bits."""
     inner = np.pad(np.ones((cells - 2, cells - 2)), 1)
     squares = np.stack([np.ones((cells, cells)), inner])
-    x, y = _weights(at, cells)
+    x, y = _weights(residuals, cells)
     drawn = y[:, None] @ squares @ x.swapaxes(1, 2)[:, None]
-    drawn = at.grid.by_patches(drawn.reshape(len(at.samples), 2, -1).astype(np.float32))
-    shown = at.grid.without_background(drawn)
-    product = shown @ at.samples[..., None]
+    drawn = residuals.grid.by_patches(drawn.reshape(len(residuals.samples), 2, -1).astype(np.float32))
+    shown = residuals.grid.without_background(drawn)
+    product = shown @ residuals.samples[..., None]
     explained = product.swapaxes(1, 2) @ np.linalg.solve(shown @ shown.swapaxes(1, 2) + TINY * np.eye(2), product)
-    return np.asarray(1.0 - explained[:, 0, 0] / np.maximum((at.samples * at.samples).sum(axis=1), TINY))
+    return np.asarray(1.0 - explained[:, 0, 0] / np.maximum((residuals.samples * residuals.samples).sum(axis=1), TINY))
 
 
-def _explained(at: PatternResiduals, which: IntArray, decoder: Decoder) -> FloatArray:
+def _explained(residuals: PatternResiduals, which: IntArray, decoder: Decoder) -> FloatArray:
     """Shares (W, 4 M) of the variance that each marker's pattern explains in each turn, at the same corners."""
     black = decoder.black
     flat = black.reshape(len(black), -1)
-    background = at.grid.by_rows(at.grid.background.T)
+    background = residuals.grid.by_rows(residuals.grid.background.T)
     shares = np.empty((len(which), len(black)))
-    at = at.only(which)
-    for row, (samples, x, y) in enumerate(zip(at.samples, *_weights(at, decoder.cells), strict=True)):
-        product = flat @ (y.T @ at.grid.by_rows(samples) @ x).ravel()
+    residuals = residuals.only(which)
+    for row, (samples, x, y) in enumerate(zip(residuals.samples, *_weights(residuals, decoder.cells), strict=True)):
+        product = flat @ (y.T @ residuals.grid.by_rows(samples) @ x).ravel()
         size = ((y.T @ y) @ black @ (x.T @ x)).reshape(len(black), -1)
         size = (size * flat).sum(axis=1) - ((flat @ (y.T @ background @ x).reshape(3, -1).T) ** 2).sum(axis=1)
         shares[row] = product * product / np.maximum(size * (samples @ samples), TINY)
     return shares
 
 
-def _weights(at: PatternResiduals, cells: int) -> Float32Array:
+def _weights(residuals: PatternResiduals, cells: int) -> Float32Array:
     """Weights (2, Q, S, m) of cells at samples along rows and along columns; the form of a lag is left out."""
-    return cell_weights(at.grid.along, cells, at.spread)[:, :, 0]
+    return cell_weights(residuals.grid.along, cells, residuals.spread)[:, :, 0]

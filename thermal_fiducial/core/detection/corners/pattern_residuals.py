@@ -43,8 +43,8 @@ class Unevenness(Stacked):
     more_contrast: Float32Array
 
     @staticmethod
-    def shown(pattern: Float32Array, rest: Float32Array, known: Float32Array, apart_px: FloatArray) -> 'Unevenness':
-        """What residuals show.
+    def estimated(pattern: Float32Array, rest: Float32Array, known: Float32Array, apart_px: FloatArray) -> 'Unevenness':
+        """What the residuals show of them.
 
         Parameters
         ----------
@@ -72,7 +72,7 @@ class Unevenness(Stacked):
         np.multiply(centred, (np.sqrt(of_contrast) / length).astype(np.float32)[..., None], out=differing[..., 1])
         return Unevenness(differing, (of_contrast * contrast / length).astype(np.float32))
 
-    def left(self, rest: Float32Array) -> Float32Array:
+    def weighted(self, rest: Float32Array) -> Float32Array:
         """Residuals (Q, n * n, P / (n * n)) times their inverse covariance: less what is uneven in each patch."""
         shown = self.differing @ (rest[:, :, None] @ self.differing).swapaxes(2, 3)
         return np.asarray(rest - shown[..., 0])
@@ -153,7 +153,7 @@ class PatternResiduals(Stacked):
         return np.asarray(self.number * self.apart_px**2)
 
 
-def linearised(
+def residuals_at(
     view: PatternView,
     quads: FloatArray,
     blur: FloatArray,
@@ -176,7 +176,7 @@ def linearised(
     uneven = None
     if view.displayed:
         pattern, left, counting = (grid.patches(values) for values in (model.value, rest, known.astype(np.float32)))
-        uneven = Unevenness.shown(pattern, left, counting, apart_px)
+        uneven = Unevenness.estimated(pattern, left, counting, apart_px)
         contrast = (grid.patches(contrast) + uneven.more_contrast[..., None]).reshape(rest.shape)
         whole, sign = np.abs(amounts[:, :1]), np.sign(amounts[:, :1])
         contrast = (sign * np.maximum(sign * contrast, _LEAST_CONTRAST * whole)).astype(np.float32)
@@ -222,7 +222,7 @@ def _weighted(rest: Float32Array, uneven: Unevenness | None) -> Float32Array:
     """Residuals (Q, P) times their inverse covariance, for noise with a variance of 1."""
     if uneven is None:
         return rest
-    return uneven.left(rest.reshape(uneven.differing.shape[:3])).reshape(rest.shape)
+    return uneven.weighted(rest.reshape(uneven.differing.shape[:3])).reshape(rest.shape)
 
 
 def fitted(

@@ -122,7 +122,7 @@ def _shown_scale(
     bends = lens_bends(start, frame.camera)
     view = PatternView(frame.image, lag=markers.blur.lag, bends=bends, saturation=frame.saturation)
     corners = markers.observed.corners_px + markers.blur.removed
-    return before.shown_by(view, corners, markers.ids, decoder, frame.blur_px)
+    return before.estimated_by(view, corners, markers.ids, decoder, frame.blur_px)
 
 
 def _measured(
