@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from thermal_fiducial.core.geometry.planar_pose import PlanarPoses
 
 _F4 = '<f4'
-#: Messages older than the newest one by more than this are those of a clock that was set back, or of a bag that was
-#: restarted [ns].
-LATEST_NS = 1_000_000_000
+#: A message may be this late [ns]: one that is older than the newest by more is of a clock that was set back, or of a
+#: bag that was restarted.
+MOST_LATE_NS = 1_000_000_000
 #: Standard deviation [rad] that a camera pose claims for turns of which it says nothing: any turn is possible.
 NOTHING_KNOWN = 3.0
 #: Standard deviation of a pose's attitude [rad] beyond which it is neither published nor begun with: a first-order
@@ -67,8 +67,11 @@ _COLUMN = {name: column for column, name in enumerate(_MARKER_NAMES) if name != 
 _CORNERS = [_COLUMN[name] for name in CORNER_FIELDS]
 _COVARIANCES = [_COLUMN[f'c{corner}{term}'] for corner in range(4) for term in ('uu', 'uv', 'uv', 'vv')]
 _COVARIANCE_TERMS = [_COLUMN[name] for name in CORNER_COVARIANCE_FIELDS]
-_OF_DETECTOR = [_COLUMN['detector_px']]
+_DETECTOR_PX = [_COLUMN['detector_px']]
 _BRANCHES = [_COLUMN[f'{prefix}{name}'] for prefix in ('', 'a') for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')]
+#: Columns of observations, and where in a table of these alone all but the last of the four parts end.
+_OBSERVED = _CORNERS + _COVARIANCES + _DETECTOR_PX + _BRANCHES
+_ENDS = np.cumsum([len(part) for part in (_CORNERS, _COVARIANCES, _DETECTOR_PX)])
 
 
 def columns(markers: Markers, names: tuple[str, ...]) -> FloatArray:
@@ -154,9 +157,9 @@ class Observations(Stacked):
     detector_px: FloatArray
     #: (N, 2, 4, 4) T_camera_marker and its alternative, NaN where there is none
     branches: FloatArray
-    #: (N, 4, 2, 6) derivative by a displacement of the camera from the first row to the last [m, rad], in map axes;
-    #: zero where no motion is known
-    by_rows: FloatArray
+    #: (N, 4, 2, 6) derivative of the corners by what the camera moves from the first row's readout to the last's [m,
+    #: rad], in map axes; zero where no motion is known
+    by_readout: FloatArray
     #: (N,) standard deviation of a coordinate by what is not known of the readout time [px]
     readout_px: FloatArray
 
@@ -171,23 +174,20 @@ class Observations(Stacked):
         """
         if getattr(markers, 'dtype', None) != MARKER_DTYPE:
             raise InputError('markers that are no rows of MARKER_DTYPE, as MarkerDetector.detect returns them')
-        numbers = _numbers(markers, _CORNERS + _COVARIANCES + _OF_DETECTOR + _BRANCHES)
-        corners = numbers[:, : len(_CORNERS)].reshape(-1, 4, 2)
-        covariances = numbers[:, len(_CORNERS) : -len(_BRANCHES) - 1].reshape(-1, 4, 2, 2)
-        detector_px = numbers[:, -len(_BRANCHES) - 1]
-        poses = numbers[:, -len(_BRANCHES) :].reshape(-1, 2, 7)
+        corners, covariances, detector_px, poses = np.split(_numbers(markers, _OBSERVED), _ENDS, axis=1)
+        corners, covariances = corners.reshape(-1, 4, 2), covariances.reshape(-1, 4, 2, 2)
+        poses = poses.reshape(-1, 2, 7)
         with np.errstate(invalid='ignore', divide='ignore'):
             branches = transform_from_quaternion(poses[..., :3], poses[..., 3:])
-        by_rows = np.zeros((len(markers), 4, 2, 6))
+        ids, count = markers['id'].astype(np.int64), len(markers)
         observations = Observations(
-            markers['id'].astype(np.int64), corners, covariances, detector_px, branches, by_rows, np.zeros(len(markers))
+            ids, corners, covariances, detector_px[:, 0], branches, np.zeros((count, 4, 2, 6)), np.zeros(count)
         )
         uu, uv, vv = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
         sound = (uu > 0.0) & (uu * vv > uv**2) & np.isfinite(corners).all(axis=2)
         usable: BoolArray = np.asarray(sound.all(axis=1))
-        ids = observations.ids.tolist()
-        if len(set(ids)) < len(ids):
-            usable &= np.array([ids.count(key) == 1 for key in ids])
+        if len(np.unique(ids)) < count:
+            usable &= (ids[:, None] == ids).sum(axis=1) == 1
         return observations if usable.all() else observations.only(usable)
 
 

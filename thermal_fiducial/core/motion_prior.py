@@ -32,7 +32,7 @@ _KEPT_NS = 500_000_000
 _MOST = 2000
 
 
-def possible(states: Sequence[Odometry]) -> list[Odometry]:
+def plausible(states: Sequence[Odometry]) -> list[Odometry]:
     """The states with a twist below ``FASTEST``."""
     twists = np.array([(state.velocity_body, state.angular_velocity_body) for state in states]).reshape(-1, 6)
     slow = (np.abs(twists) < FASTEST).all(axis=1)
@@ -49,7 +49,7 @@ class MotionPrior:
     """
 
     def __init__(
-        self, camera_time_offset: float = 0.0, read: Callable[[Sequence[Any]], list[Odometry]] = possible
+        self, camera_time_offset: float = 0.0, read: Callable[[Sequence[Any]], list[Odometry]] = plausible
     ) -> None:
         self._stamps_ns: list[int] = []
         self._states: list[Any] = []

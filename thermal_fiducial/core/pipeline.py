@@ -22,17 +22,13 @@ from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.core.filter.belief import PoseUpdate
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.se3 import (
-    quaternion_from_rotation,
-    rotation_from_quaternion,
-    transform,
-)
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.mapping.keyframes import VIEWS
 from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import ImuSample, Markers, Odometry, places_of, whole_ns
-from thermal_fiducial.core.motion_prior import MotionPrior, possible
+from thermal_fiducial.core.motion_prior import MotionPrior, plausible
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
 
@@ -78,12 +74,12 @@ class FrameResult:
 
 def as_published(T: FloatArray) -> FloatArray:
     """A transform after conversion to position and quaternion and back, as in a message."""
-    return transform(rotation_from_quaternion(quaternion_from_rotation(T[:3, :3])), T[:3, 3])
+    return transform_from_quaternion(T[:3, 3], quaternion_from_rotation(T[:3, :3]))
 
 
 def as_received(states: Sequence[Odometry]) -> list[Odometry]:
     """The filter's odometry as detector and mapper read it from its messages."""
-    return possible([replace(state, T_map_body=as_published(state.T_map_body)) for state in states])
+    return plausible([replace(state, T_map_body=as_published(state.T_map_body)) for state in states])
 
 
 class Pipeline:

@@ -17,8 +17,8 @@ class StampClock:
     def __init__(self) -> None:
         self._count = self._first_second = self._last_ns = 0
 
-    def stands(self, stamp_ns: int) -> bool:
-        """Take in the next stamp; whether it and those before it are no clock."""
+    def shows_none(self, stamp_ns: int) -> bool:
+        """Take in the next stamp; whether it and those before it show that there is no clock."""
         second, rest_ns = divmod(stamp_ns, SECOND_NS)
         if rest_ns >= _FIRST_NS:
             self._count = 0

@@ -42,11 +42,11 @@ class Stacked:
         """Put ``others`` in the place of the items at ``which``, in their order."""
         names: tuple[str, ...] = self.__slots__
         for name in names:
-            field, there = getattr(self, name), getattr(others, name)
+            field, theirs = getattr(self, name), getattr(others, name)
             if isinstance(field, Stacked):
-                field.put(which, there)
+                field.put(which, theirs)
             elif isinstance(field, np.ndarray):
-                field[which] = there
+                field[which] = theirs
 
     def _changed(self, change: Callable[..., Any], *others: Self) -> Self:
         """The batch with each array, also of batches in it, changed by what ``others`` have in its place."""

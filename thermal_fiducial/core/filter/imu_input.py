@@ -114,7 +114,7 @@ class ImuInput:
             return Verdict.NOT_FINITE
         if any(abs(value) > limit for value, limit in zip(values, self._limits, strict=True)):
             return Verdict.IMPOSSIBLE
-        if self._clock.stands(sample.stamp_ns):
+        if self._clock.shows_none(sample.stamp_ns):
             return Verdict.NO_CLOCK
         frozen = [axis.is_frozen(sample.stamp_ns, value) for axis, value in zip(self._axes, values, strict=True)]
         if any(frozen):

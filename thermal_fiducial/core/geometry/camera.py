@@ -174,7 +174,7 @@ class Camera:
             J = J[:, 3:5]
         # One product of matrices costs less than one for each point.
         uv = distorted.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]
-        by_x = J.reshape(-1, 4) @ self._by_rows
+        by_x = J.reshape(-1, 4) @ self._focal_lengths_by_rows
         return uv.reshape(x.shape), by_x.reshape(*x.shape, 2)
 
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
@@ -191,9 +191,9 @@ class Camera:
         uv = np.asarray(uv, dtype=np.float64)
         x = (uv - self.K[:2, 2]) @ self._inverse_focal.T
         for _ in range(_STEPS):
-            there, J = self.distort_linearised(x)
+            reached, J = self.distort_linearised(x)
             with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
-                step = (inverse_2x2(J) @ (uv - there)[..., None])[..., 0]
+                step = (inverse_2x2(J) @ (uv - reached)[..., None])[..., 0]
             x = x + step
             if np.abs(step).max(initial=0.0) < _SHORT:
                 break
@@ -264,8 +264,8 @@ class Camera:
         return np.array([self.width - 1.0, self.height - 1.0])
 
     @cached_property
-    def _by_rows(self) -> FloatArray:
-        """(4, 4) product with the focal lengths of matrices (2, 2) that are written in rows."""
+    def _focal_lengths_by_rows(self) -> FloatArray:
+        """(4, 4) by which derivatives (2, 2) of distorted coordinates, written in rows, become those of pixels."""
         return np.asarray(np.kron(self.K[:2, :2].T, np.eye(2)))
 
     @cached_property

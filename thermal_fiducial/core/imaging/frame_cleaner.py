@@ -16,7 +16,7 @@ from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.camera_frames import FramePeriod, pixel_noise
 from thermal_fiducial.core.geometry.plausibility import require_image
 from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder
-from thermal_fiducial.core.measurements import LATEST_NS
+from thermal_fiducial.core.measurements import MOST_LATE_NS
 from thermal_fiducial.core.stamp_clock import NO_CLOCK, StampClock
 from thermal_fiducial.core.types import Counts, Gray, IntArray
 from thermal_fiducial.errors import InputError
@@ -120,15 +120,15 @@ class FrameCleaner:
             Not an image of 8 or 16 bit, or one too small to hold a scene; a listed bad pixel outside it.
         """
         image = self._image(counts)
-        if image.shape != self._shape or stamp_ns < self._newest_ns - LATEST_NS:
+        if image.shape != self._shape or stamp_ns < self._newest_ns - MOST_LATE_NS:
             self._restart(image.shape)
         if stamp_ns in self._stamps:
             return CleanFrame(None, REPEATED_STAMP)
-        if self._clock.stands(stamp_ns):
+        if self._clock.shows_none(stamp_ns):
             return CleanFrame(None, NO_CLOCK)
         late = stamp_ns < self._newest_ns
         self._newest_ns = max(stamp_ns, self._newest_ns)
-        self._stamps = {stamp for stamp in self._stamps if stamp >= self._newest_ns - LATEST_NS} | {stamp_ns}
+        self._stamps = {stamp for stamp in self._stamps if stamp >= self._newest_ns - MOST_LATE_NS} | {stamp_ns}
         frozen = self._freeze.repeats(image, coarse=counts.dtype == np.uint8)
         if frozen or self._shutter.closed(stamp_ns, image):
             self._pauses.add_old(stamp_ns, self.config.settle_frames)

@@ -196,7 +196,7 @@ class LocatedFrame:
 
     stamp_ns: int
     camera: Camera
-    #: all N markers, without what an undeclared readout displaces them by, and also without the known error of the lens
+    #: all N markers, as the detector has them, and without what is estimated of an undeclared readout and of the lens
     raw: Observations
     observed: Observations
     #: which (N,) are in the map, and these

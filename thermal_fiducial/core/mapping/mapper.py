@@ -125,7 +125,8 @@ class MarkerMapper:
     def locate(self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None) -> LocatedFrame:
         """First half of :meth:`process`, up to the pose, which can be published before the map is updated."""
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
-        raw, errors = self.readout.read_by_rows(Observations.of(markers), camera, predicted), self._errors_of(camera)
+        errors = self._errors_of(camera)
+        raw = self.readout.with_readout_derivative(Observations.of(markers), camera, predicted)
         observed = self.readout.corrected(raw, predicted)
         observed = replace(observed, corners=without_found_aspect(observed.corners, camera, errors))
         # Step 2: known and new markers.

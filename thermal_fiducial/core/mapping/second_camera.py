@@ -15,7 +15,7 @@ from thermal_fiducial.core.camera_frames import FramePeriod
 from thermal_fiducial.core.error_model import CORRELATED_POSES, covariance_of_one_error
 from thermal_fiducial.core.geometry.se3 import difference, inverse, lever_arm, retract
 from thermal_fiducial.core.mapping.located import squared_distance
-from thermal_fiducial.core.measurements import CameraPose, LATEST_NS
+from thermal_fiducial.core.measurements import CameraPose, MOST_LATE_NS
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -103,7 +103,7 @@ class SecondCamera:
     def add_second(self, pose: CameraPose, prior: MotionPrior) -> CameraPose | None:
         """Add a pose of the second camera; returned as a pose of the first, in its clock, while that has none."""
         pose = self._of_first(pose)
-        if pose.stamp_ns < self._second_ns - LATEST_NS:
+        if pose.stamp_ns < self._second_ns - MOST_LATE_NS:
             # The clock was set back: the first one's last pose says nothing of now.
             self._first_ns = None
         self._second_ns = pose.stamp_ns

@@ -59,22 +59,25 @@ class UndeclaredReadout:
         self._common: FloatArray = np.zeros(DRAWS)
         self._is_by_map = False
 
-    def read_by_rows(self, observed: Observations, camera: Camera, predicted: PredictedCamera | None) -> Observations:
-        """N markers with what displaces their corners where rows are read late, as the detector has them.
+    def with_readout_derivative(
+        self, observed: Observations, camera: Camera, predicted: PredictedCamera | None
+    ) -> Observations:
+        """The observations with the derivative of their corners by what the camera moves in the readout.
 
-        Such rows bend the outline of a marker, and the detector pulls it towards a square as far as the noise of the
-        corners allows (``as_squares``).
+        It is that of the detector's corners, not of the image's: rows that are read late bend the outline of a marker,
+        and the detector pulls it towards a square as far as the noise of the corners allows (``as_squares``).
         """
         if predicted is None or self._prior_std == 0.0 or len(observed.ids) == 0:
             return observed
-        at, R = ImagePoints.at(observed.corners, camera), predicted.pose.T_map_camera[:3, :3]
-        J_camera = at.J @ interaction(at.x, _depths(at.x, observed.branches[:, 0])) @ turn_of_pose(R.T)
+        points, R = ImagePoints.at(observed.corners, camera), predicted.pose.T_map_camera[:3, :3]
+        depths = _depths(points.x, observed.branches[:, 0])
+        J_camera = points.J @ interaction(points.x, depths) @ turn_of_pose(R.T)
         displaced = camera.readout_shares(observed.corners[..., 1])[..., None, None] * J_camera
-        J = squareness(at.x, at.inverse)[1].reshape(-1, 2, 4, 2).swapaxes(1, 2)
+        J = squareness(points.x, points.inverse)[1].reshape(-1, 2, 4, 2).swapaxes(1, 2)
         spread = observed.covariances @ J.swapaxes(-1, -2)
         information = inverse_2x2((J @ spread).sum(axis=1) + SQUARE_STD**2 * np.eye(2))
         pulled = information @ (J @ displaced).sum(axis=1)
-        return replace(observed, by_rows=displaced - spread @ pulled[:, None])
+        return replace(observed, by_readout=displaced - spread @ pulled[:, None])
 
     def corrected(self, observed: Observations, predicted: PredictedCamera | None) -> Observations:
         """The corners of N markers at the stamp, without what the time displaces them by in a camera in motion."""
@@ -92,7 +95,7 @@ class UndeclaredReadout:
         """The location, whose covariance has what is not known of the time."""
         if predicted is None or self.estimate.std == 0.0:
             return location
-        rates = (location.sight.observed.by_rows @ predicted.velocity).reshape(-1, 2)
+        rates = (location.sight.observed.by_readout @ predicted.velocity).reshape(-1, 2)
         moved = np.einsum('nij,nj->i', location.corner_gains, rates)
         return replace(location, pose=location.pose.widened(covariance_of_one_error(moved, self.estimate.std)))
 
@@ -108,7 +111,7 @@ class UndeclaredReadout:
         W_robust = roots[..., None] * W
         Q = np.linalg.qr((W_robust @ fit.J_camera.reshape(*squared.shape, 2, 6)).reshape(-1, 6))[0]
         # Derivatives (8 N, 6) by a displacement in the time that the pose does not take up.
-        left = _without(Q, (W_robust @ sight.observed.by_rows).reshape(-1, 6))
+        left = _without(Q, (W_robust @ sight.observed.by_readout).reshape(-1, 6))
         by_time, rest = left @ predicted.velocity, _without(Q, (roots * residuals).ravel())
         information, shown = float(by_time @ by_time), float(by_time @ rest)
         unsure = float(np.sum(left @ predicted.velocity_covariance(1.0) * left))
@@ -153,8 +156,8 @@ class UndeclaredReadout:
 
 def rates_of_rows(observed: Observations, predicted: PredictedCamera) -> tuple[FloatArray, FloatArray]:
     """Displacement (N, 4, 2) of the corners of N markers by each second of the time [px/s], and its covariances."""
-    by_rows = observed.by_rows
-    return by_rows @ predicted.velocity, by_rows @ predicted.velocity_covariance(1.0) @ by_rows.swapaxes(-1, -2)
+    by_readout, unsure = observed.by_readout, predicted.velocity_covariance(1.0)
+    return by_readout @ predicted.velocity, by_readout @ unsure @ by_readout.swapaxes(-1, -2)
 
 
 def _depths(x: FloatArray, T_camera_marker: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 
 from thermal_fiducial.core.error_model import at_most_claimed
 from thermal_fiducial.core.geometry.se3 import inverse
-from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
+from thermal_fiducial.core.measurements import CameraPose, in_moved_map, MOST_LATE_NS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.counting import CountingNode
@@ -30,7 +30,7 @@ class _Corrections:
 
     def since(self, stamp_ns: int) -> list[FloatArray]:
         """Corrections (4, 4) after a frame, the oldest first; larger differences of stamps are due to another clock."""
-        return [T_new_old for after_ns, T_new_old in self._log if 0 <= after_ns - stamp_ns <= LATEST_NS]
+        return [T_new_old for after_ns, T_new_old in self._log if 0 <= after_ns - stamp_ns <= MOST_LATE_NS]
 
 
 class LatePoses:
@@ -43,7 +43,7 @@ class LatePoses:
 
     def add(self, stamp_ns: int) -> None:
         """Log the stamp of a frame; a much older stamp means a backward clock jump."""
-        self.newest_ns = max(stamp_ns, self.newest_ns) if stamp_ns >= self.newest_ns - LATEST_NS else stamp_ns
+        self.newest_ns = max(stamp_ns, self.newest_ns) if stamp_ns >= self.newest_ns - MOST_LATE_NS else stamp_ns
 
     def moved(self, T_new_old: FloatArray) -> None:
         """Log that the map moved by ``T_new_old`` (4, 4) after the newest frame."""
@@ -101,7 +101,7 @@ class MapCorrections:
         of_stamp = (error for error in reversed(self._errors) if error.stamp_ns == pose.stamp_ns)
         self._error = next(of_stamp, self._error)
         error = self._error
-        if error is not None and abs(pose.stamp_ns - error.stamp_ns) <= LATEST_NS:
+        if error is not None and abs(pose.stamp_ns - error.stamp_ns) <= MOST_LATE_NS:
             # It changes slowly: that of another pose is used where that of this one is missing.
             pose = replace(pose, map_covariance=at_most_claimed(error.covariance, pose.covariance))
         for T_new_old in self._corrections.since(pose.stamp_ns):
