@@ -31,7 +31,7 @@ def _independent(gains: Any, draws: Any) -> Any:
     return np.sqrt(len(draws)) * np.concatenate(list(gains @ draws), axis=-1)
 
 
-def _no_lens(_: Any, gains: Any, of: Any, count: int, errors: Any) -> Any:
+def _no_lens(_: Any, gains: Any, group: Any, count: int) -> Any:
     """Draws of what the lenses have no part in."""
     return np.zeros((count, gains.shape[2], DRAWS))
 
@@ -111,7 +111,7 @@ MECHANISMS = {
     'shape of markers': Mechanism(
         ('shaped markers', 'wall', 'chain'),
         ('error_sources:ErrorSources._shapes',),
-        {'error_sources:ErrorSources._shapes': lambda self, _: np.zeros(len(self.problem.ids))},
+        {'error_sources:ErrorSources._shapes': lambda self: np.zeros(len(self.problem.ids))},
     ),
     'lens in the errors of the map': Mechanism(
         ('bent corridor', 'wall'),

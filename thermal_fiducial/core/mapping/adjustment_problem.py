@@ -269,7 +269,7 @@ class MapProblem:
             J_common=self.J_common[views],
         )
 
-    def spread(self, most: int) -> BoolArray:
+    def thinned(self, most: int) -> BoolArray:
         """Which views (n,) are of at most so many of each marker, at equal distances among all of these."""
         order, starts = self._by_marker
         counts = np.diff(starts, append=len(order))

@@ -76,46 +76,46 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
         return None
     now = problem.evaluate(problem.start)
     if problem.J_common[..., 0].any():
-        problem = _weighed(problem, snapshot, now)
+        problem = _with_weight_of_aspect(problem, snapshot, now)
     now = _minimise(problem, now)
     mirrored = _with_mirrored(problem, now)
     now = now if mirrored is None else _minimise(problem, mirrored)
     return _result(problem, snapshot, now)
 
 
-def _sources(problem: MapProblem, now: Linearised) -> tuple[float, ErrorSources | None]:
-    """The factor of all variances by the residuals, and the errors, priors divided by that factor."""
+def _error_sources(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> ErrorSources | None:
+    """What the errors of the adjusted map come from; None where its equations are singular."""
     scale = _scale(now.chi2)
     weights = now.weights(scale)
     full = weights == 1.0
     unknowns = 6 * (len(problem.stamps) + np.count_nonzero(~problem.held))
-    widened = noise_factor(float(np.sum(now.chi2[full])), int(8 * np.count_nonzero(full) - unknowns))
+    factor = noise_factor(float(np.sum(now.chi2[full])), int(8 * np.count_nonzero(full) - unknowns))
     # What corners are off beyond their claim says nothing of priors: these keep theirs.
     problem = replace(
         problem,
-        odometry=problem.odometry.divided(widened),
-        known=problem.known.divided(widened),
-        common_information=problem.common_information * (1.0, widened),
+        odometry=problem.odometry.divided(factor),
+        known=problem.known.divided(factor),
+        common_information=problem.common_information * (1.0, factor),
     )
     system = problem.equations.reduced(problem.normal(now, scale)[0])
     if system is None:
-        return widened, None
-    return widened, ErrorSources(problem, system, now, weights, np.random.default_rng(0))
+        return None
+    return ErrorSources(problem, system, now, weights, snapshot.errors, factor, np.random.default_rng(0))
 
 
-def _weighed(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> MapProblem:
+def _with_weight_of_aspect(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> MapProblem:
     """The problem with that information of the aspect ratio's prior by which the estimate is nearest to the error.
 
     The smooth error of the lens and the markers' shapes look like one, too. So the information is not one, but what the
     joint draws of all of them say. It stays one where these do not exist.
     """
-    widened, sources = _sources(problem, now)
+    sources = _error_sources(problem, snapshot, now)
     if sources is None:
         return problem
     prior = float(problem.common_information[0])
     shown = 1.0 / sources.system.covariance[0, 0] - prior
     gain = shown / (shown + prior)
-    best = min(gain**2 / max(sources.variance_of_aspect(widened, snapshot.errors), TINY), 1.0 - TINY)
+    best = min(gain**2 / max(sources.variance_of_aspect(), TINY), 1.0 - TINY)
     if best <= TINY:
         return problem
     return replace(problem, common_information=np.append(shown * (1.0 / best - 1.0), problem.common_information[1:]))
@@ -145,7 +145,7 @@ def _with_mirrored(problem: MapProblem, now: Linearised) -> Linearised | None:
     views are asked only of markers whose other pose is not ruled out by as many of them as place a new marker.
     """
     scale = _scale(now.chi2)
-    _, gains = _mirrored(problem, now, problem.spread(MAX_VIEWS), scale)
+    _, gains = _mirrored(problem, now, problem.thinned(MAX_VIEWS), scale)
     possible = ~problem.held & ~problem.known.information.any(axis=(1, 2)) & (gains > -UNAMBIGUOUS * scale)
     if not possible.any():
         return None
@@ -199,13 +199,13 @@ def _scale(chi2: FloatArray) -> float:
 
 def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> AdjustedMap | None:
     """The outcome with its covariances; None where these do not exist."""
-    widened, sources = _sources(problem, now)
+    sources = _error_sources(problem, snapshot, now)
     if sources is None:
         return None
     full = sources.weights == 1.0
     known = np.stack([snapshot.markers[key].draws for key in problem.ids])
     unit = snapshot.errors.readout_time_std
-    covariances, draws, aspect_left, readout_std = sources.of_markers(widened, snapshot.errors, known)
+    covariances, draws, aspect_left, readout_std = sources.of_markers(known)
     if not np.all(np.isfinite(covariances)):
         return None
     markers, inconsistent = {}, {}
@@ -224,7 +224,7 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
         markers,
         dict(zip(problem.stamps, now.state.T_map_camera, strict=True)),
         problem.rms_px(now),
-        now.cost(_scale(now.chi2)) / widened,
+        now.cost(_scale(now.chi2)) / sources.variance_factor,
         inconsistent,
         snapshot.map_revision,
         FoundAspect(problem.camera, float(now.state.common[0]), aspect_left),

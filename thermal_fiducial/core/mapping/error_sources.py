@@ -46,38 +46,41 @@ class ErrorSources:
     now: Linearised
     #: (n,) robust weights of the views
     weights: FloatArray
+    #: systematic errors as declared, those of corners as learned
+    errors: SystematicErrors
+    #: by which the residuals widen all variances; covariances of priors come divided by it
+    variance_factor: float
     rng: np.random.Generator
 
-    def of_markers(self, widened: float, errors: SystematicErrors, known: FloatArray) -> MapErrors:
+    def of_markers(self, known: FloatArray) -> MapErrors:
         """Errors of the markers, and what is left of those of aspect ratio and readout time.
 
         Parameters
         ----------
-        widened : factor of all variances; covariances of priors come divided by it
         known : (M, 6, K) draws of the held markers; others are not used
         """
         system, problem, positions = self.system, self.problem, self.now.state.T_map_marker[:, :3, 3]
-        by_corners = system.solve(self._lasting(errors))
+        by_corners = system.solve(self._lasting())
         by_held = system.by_held(np.concatenate([known, np.zeros_like(known[:1])]))
         common = covariance_root(self.noise_of_common) @ self.rng.standard_normal((len(by_corners.common), DRAWS))
-        by_noise = np.sqrt(widened) * system.drawn(common, self.rng)
-        covariances = widened * system.covariances(self.noise_of_common)[:-1]
+        by_noise = np.sqrt(self.variance_factor) * system.drawn(common, self.rng)
+        covariances = self.variance_factor * system.covariances(self.noise_of_common)[:-1]
         covariances += covariance_by_draws(by_corners.nodes[:-1]) + covariance_by_draws(by_held.nodes[:-1])
-        covariances += scale_of_map(arms_of_scale(positions, positions[problem.anchors]), errors)
+        covariances += scale_of_map(arms_of_scale(positions, positions[problem.anchors]), self.errors)
         draws = by_corners.nodes + by_noise + by_held.nodes
-        found = by_corners.common + np.sqrt(widened) * common + by_held.common
-        aspect = LensErrors(problem.corners[:1], problem.camera, errors).aspect_draws
+        found = by_corners.common + np.sqrt(self.variance_factor) * common + by_held.common
+        aspect = LensErrors(problem.corners[:1], problem.camera, self.errors).aspect_draws
         return MapErrors(covariances, draws[:-1], aspect - found[0], float(np.sqrt(np.mean(found[1] ** 2))))
 
-    def variance_of_aspect(self, widened: float, errors: SystematicErrors) -> float:
+    def variance_of_aspect(self) -> float:
         """Of what is estimated of the aspect ratio's error, by noise and all other errors, itself among these."""
         problem, now, moved, covariance = self.problem, self.now, self.system.moved, self.system.covariance
         of_cameras = np.swapaxes(now.to_camera, -1, -2) @ moved.frames[problem.frame]
         by_common = problem.J_common - now.J @ (moved.nodes[problem.marker] + of_cameras)
         gains = self._by_corners(by_common @ (covariance[:, :1] / covariance[0, 0]))
-        of_shapes = np.sum(problem.over_markers(gains) ** 2, axis=(1, 2, 3)) @ self._shapes(errors) ** 2
-        of_lens = LensErrors(problem.corners, problem.camera, errors).covariance(gains.reshape(-1, 1, 2)).item()
-        noise = widened * self.noise_of_common[0, 0]
+        of_shapes = np.sum(problem.over_markers(gains) ** 2, axis=(1, 2, 3)) @ self._shapes() ** 2
+        of_lens = LensErrors(problem.corners, problem.camera, self.errors).covariance(gains.reshape(-1, 1, 2)).item()
+        noise = self.variance_factor * self.noise_of_common[0, 0]
         return float(covariance[0, 0] ** 2 * (of_shapes + of_lens) + noise)
 
     @property
@@ -87,19 +90,19 @@ class ErrorSources:
         by_aspect = covariance[:, :1]
         return np.asarray(covariance - self.problem.common_information[0] * by_aspect @ by_aspect.T)
 
-    def _lasting(self, errors: SystematicErrors) -> Vectors:
+    def _lasting(self) -> Vectors:
         """Right sides by corner errors that are the same in all views of a marker, and by those of the lens.
 
         They do not average out and leave no residuals: the shape of a fixed marker rotates the whole map, and a lens
         that is wrong bends it.
         """
         problem, now = self.problem, self.now
-        shapes = self._shapes(errors)[:, None, None] * self.rng.standard_normal((len(problem.ids), 8, DRAWS))
+        shapes = self._shapes()[:, None, None] * self.rng.standard_normal((len(problem.ids), 8, DRAWS))
         # What is common has its part of each keyframe's views, too.
         J_frame = np.concatenate([now.J @ np.swapaxes(now.to_camera, -1, -2), problem.J_common], axis=-1)
         of_frames, of_markers = self._by_corners(J_frame), self._by_corners(now.J)
-        frames = self._by_lens(of_frames, problem.frame, len(problem.stamps), errors)
-        nodes = self._by_lens(of_markers, problem.marker, len(problem.ids), errors)
+        frames = self._by_lens(of_frames, problem.frame, len(problem.stamps))
+        nodes = self._by_lens(of_markers, problem.marker, len(problem.ids))
         # Each marker has one shape, and a keyframe many markers.
         nodes += np.swapaxes(problem.over_markers(of_markers), 1, 2).reshape(len(nodes), 6, 8) @ shapes
         of_views = np.swapaxes(of_frames, 1, 2).reshape(len(of_frames), -1, 8)
@@ -108,11 +111,11 @@ class ErrorSources:
             frames[frame] += drawn_sum(of_views[views], shapes[problem.marker[views]])
         return Vectors(frames[:, :6], np.concatenate([nodes, np.zeros_like(nodes[:1])]), frames[:, 6:].sum(axis=0))
 
-    def _by_lens(self, gains: FloatArray, of: IntArray, count: int, errors: SystematicErrors) -> FloatArray:
-        """Draws (count, m, K) by the lens, of what has derivatives (n, 4, m, 2): sums over views ``of`` (n,) each."""
-        order, result = np.argsort(of, kind='stable'), np.zeros((count, gains.shape[2], DRAWS))
-        some, starts = np.unique(of[order], return_index=True)
-        lens = LensErrors(self.problem.corners[order], self.problem.camera, errors)
+    def _by_lens(self, gains: FloatArray, group: IntArray, count: int) -> FloatArray:
+        """Draws (count, m, K) by the lens of what has derivatives (n, 4, m, 2), summed over views by ``group`` (n,)."""
+        order, result = np.argsort(group, kind='stable'), np.zeros((count, gains.shape[2], DRAWS))
+        some, starts = np.unique(group[order], return_index=True)
+        lens = LensErrors(self.problem.corners[order], self.problem.camera, self.errors)
         result[some] = lens.drawn_sums(gains[order].reshape(4 * len(order), -1, 2), 4 * starts)
         return result
 
@@ -121,11 +124,11 @@ class ErrorSources:
         weighted = (self.weights[:, None, None] * J).reshape(len(J), 4, 2, -1)
         return np.asarray(np.swapaxes(weighted, -1, -2) @ self.problem.W)
 
-    def _shapes(self, errors: SystematicErrors) -> FloatArray:
+    def _shapes(self) -> FloatArray:
         """Standard deviations (M,) [px] of corner errors that are the same in all views of a marker."""
         problem = self.problem
         precision = 0.5 * np.mean(np.sum(problem.W**2, axis=(2, 3)), axis=1)
         views = np.bincount(problem.marker)
         middle = np.cumsum(views) - 1 - views // 2
         typical = 1.0 / precision[np.lexsort((precision, problem.marker))[middle]]
-        return shape_of_corners(views / np.bincount(problem.marker, precision), typical, errors)
+        return shape_of_corners(views / np.bincount(problem.marker, precision), typical, self.errors)

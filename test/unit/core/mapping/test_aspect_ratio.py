@@ -62,13 +62,13 @@ def test_the_variance_of_what_is_estimated_is_that_of_its_draws():
     system = problem.equations.reduced(problem.normal(now, 1.0)[0])
     estimated = []
     for seed in range(30):
-        sources = ErrorSources(problem, system, now, weights, np.random.default_rng(seed))
-        errors = sources.of_markers(1.0, m.errors, np.zeros((len(problem.ids), 6, DRAWS)))
+        sources = ErrorSources(problem, system, now, weights, m.errors, 1.0, np.random.default_rng(seed))
+        errors = sources.of_markers(np.zeros((len(problem.ids), 6, DRAWS)))
         lens = LensErrors(problem.corners[:1], CALIBRATED, m.errors)
         estimated.append(lens.aspect_draws - errors.aspect_left)
     # The lens has the same draws each time, and these have just its covariance; 1920 draws of noise and shapes are
     # accurate to 3 %: three standard deviations.
-    assert np.isclose(np.mean(np.square(estimated)), sources.variance_of_aspect(1.0, m.errors), rtol=0.1)
+    assert np.isclose(np.mean(np.square(estimated)), sources.variance_of_aspect(), rtol=0.1)
 
 
 @pytest.mark.parametrize('share', [0.0, 0.02])
