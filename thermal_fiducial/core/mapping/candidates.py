@@ -61,10 +61,10 @@ class Candidate:
         stamps = [kept.stamp_ns for kept in self.views]
         if view.stamp_ns in stamps:
             self.views[stamps.index(view.stamp_ns)] = view
-        elif (like := self._from_the_same_direction(view)) is None:
+        elif (alike := self._from_the_same_direction(view)) is None:
             self.views.append(view)
-        elif view.viewpoint.turn_std < BETTER * self.views[like].viewpoint.turn_std:
-            self.views[like] = view
+        elif view.viewpoint.turn_std < BETTER * self.views[alike].viewpoint.turn_std:
+            self.views[alike] = view
         else:
             return
         self.untried += 1
@@ -141,7 +141,7 @@ class NewMarkers:
         #: in whose pixels all views are
         self._camera: Camera | None = None
 
-    def show(
+    def add_views(
         self, stamp_ns: int, observed: Observations, camera: Camera, viewpoint: Viewpoint, errors: SystematicErrors
     ) -> tuple[list[MapMarker], dict[int, str]]:
         """Add a frame's views to the candidates, except markers without a pose.

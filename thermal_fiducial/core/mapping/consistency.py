@@ -205,9 +205,9 @@ class Consistency:
             self._shares[marker.id] = share
             if marker.trusted and share > QUARANTINE:
                 in_frames = f'in most of the last {1.0 / NEW_FRAME_SHARE:.0f} frames'
-                self._set_standing(markers, marker.id, f'{error:.1f} px off, {ratio:.1f} sigma, {in_frames}')
+                self._set_trusted(markers, marker.id, f'{error:.1f} px off, {ratio:.1f} sigma, {in_frames}')
             elif not marker.trusted and share < RELEASE:
-                self._set_standing(markers, marker.id, '')
+                self._set_trusted(markers, marker.id, '')
             else:
                 continue
             changed = True
@@ -229,7 +229,7 @@ class Consistency:
         better_known = np.array([marker.trusted for marker in known]) & by_map
         return by_map if better_known.any() and not np.any(left_out & has_agreed) else either
 
-    def flag(self, markers: dict[int, MapMarker], outliers: Mapping[int, float]) -> None:
+    def quarantine(self, markers: dict[int, MapMarker], outliers: Mapping[int, float]) -> None:
         """Put markers in quarantine that a bundle adjustment found inconsistent; frames may release them later.
 
         Parameters
@@ -241,9 +241,9 @@ class Consistency:
                 continue
             self._shares[marker_id] = 1.0
             reason = f'{100.0 * share:.0f} % of its views contradict the joint refinement'
-            self._set_standing(markers, marker_id, reason)
+            self._set_trusted(markers, marker_id, reason)
 
-    def _set_standing(self, markers: dict[int, MapMarker], marker_id: int, reason: str) -> None:
+    def _set_trusted(self, markers: dict[int, MapMarker], marker_id: int, reason: str) -> None:
         """Put one of ``markers`` in quarantine for a ``reason``, or release it if that is empty."""
         markers[marker_id] = replace(markers[marker_id], trusted=not reason)
         self.quarantined.pop(marker_id, None)

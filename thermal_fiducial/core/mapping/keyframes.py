@@ -160,7 +160,7 @@ class KeyframeStore:
         self.frames[frame.stamp_ns] = frame
         self._added += 1
         if len(self.frames) > self._budget:
-            kept = self._spread(int(_THINNED * self._budget))
+            kept = self._thinned_out(int(_THINNED * self._budget))
             self.frames = {stamp: frame for stamp, frame in self.frames.items() if stamp in kept}
 
     def keep(self, observed: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
@@ -265,10 +265,10 @@ class KeyframeStore:
         total = sum(len(frame.ids) for frame in self.frames.values())
         if total <= views:
             return tuple(self.frames.values())
-        kept = self._spread(max(len(self.frames) * views // total, 1))
+        kept = self._thinned_out(max(len(self.frames) * views // total, 1))
         return tuple(frame for stamp, frame in self.frames.items() if stamp in kept)
 
-    def _spread(self, room: int) -> set[int]:
+    def _thinned_out(self, room: int) -> set[int]:
         """Stamps of about ``room`` keyframes from all places and directions, and of all bridges."""
         coarseness = 1.0
         while len(cells := self._cells(coarseness)) > room:

@@ -84,7 +84,7 @@ class MarkerMap:
     dictionary: str = 'DICT_4X4_50'
     revision: int = 1
     #: revision and anchors, cached: finding them takes long in a large map
-    _held: tuple[int, FloatArray] | None = field(default=None, init=False, repr=False, compare=False)
+    _anchors: tuple[int, FloatArray] | None = field(default=None, init=False, repr=False, compare=False)
 
     @property
     def size_in_words(self) -> str:
@@ -147,11 +147,11 @@ class MarkerMap:
     @property
     def anchors(self) -> FloatArray:
         """Positions (H, 3) of the markers that carry the scale: see :func:`gauge`."""
-        if self._held is None or self._held[0] != self.revision:
+        if self._anchors is None or self._anchors[0] != self.revision:
             markers = list(self.markers.values())
             held = [marker for marker, is_held in zip(markers, gauge(markers), strict=True) if is_held]
-            self._held = self.revision, np.array([marker.T_map_marker[:3, 3] for marker in held]).reshape(-1, 3)
-        return self._held[1]
+            self._anchors = self.revision, np.array([marker.T_map_marker[:3, 3] for marker in held]).reshape(-1, 3)
+        return self._anchors[1]
 
     def rows(self, in_view: Collection[int] = ()) -> np.ndarray:
         """Rows (N,) of :data:`MAP_DTYPE`, ordered by ID; ``in_view`` are the IDs that the frame at hand shows."""

@@ -213,7 +213,7 @@ class MarkerMapper:
 
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, Waiting]:
         """Add views to the candidates of new markers; whether any entered the map, and what the others wait for."""
-        placed, waiting = self._new.show(
+        placed, waiting = self._new.add_views(
             frame.stamp_ns, frame.new, frame.camera, viewpoint, self._errors_of(frame.camera)
         )
         self.map.markers |= {marker.id: marker for marker in placed}
@@ -296,7 +296,7 @@ class MarkerMapper:
         self.map.adjust(refinement.markers)
         self._found = refinement.aspect
         self.readout.adopt(refinement.readout)
-        self._consistency.flag(self.map.markers, refinement.inconsistent)
+        self._consistency.quarantine(self.map.markers, refinement.inconsistent)
         self._new.move(self._keyframes.move(refinement.keyframes))
         self.resets += 1
         return True

@@ -83,7 +83,7 @@ def test_a_marker_enters_where_it_is_though_the_calibration_changes_meanwhile(ch
             np.zeros((1, 4, 2, 6)),
             np.zeros(1),
         )
-        placed += new.show(own.stamp_ns, shown, camera, own.viewpoint, errors)[0]
+        placed += new.add_views(own.stamp_ns, shown, camera, own.viewpoint, errors)[0]
     (marker,) = placed
     # Corners without noise, but for the cameras' own 0.1 mm and mrad.
     np.testing.assert_allclose(marker.T_map_marker, T_MAP_MARKER, atol=1e-3)
