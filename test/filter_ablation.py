@@ -53,11 +53,11 @@ MECHANISMS = {
         (
             'pose_noise:BodyPose.map_changes',
             'pose_noise:BodyPose.moved_by',
-            'update:_with_markers',
+            'update:_propagated_to_markers',
             'update:_in_map_of_markers',
             'update:map_jacobian',
         ),
-        {'update:_with_markers': lambda config, estimate, _: estimate},
+        {'update:_propagated_to_markers': lambda config, estimate, _: estimate},
     ),
     'size of white errors is learned': Mechanism(
         ('noise of poses', 'lasting errors'),

@@ -77,8 +77,8 @@ class Hypothesis(NamedTuple):
     refused_in_row: int = 0
     #: innovation (6,) of the latest refused pose; zero before the first
     against: FloatArray = np.zeros(6)
-    #: squared standard deviations by which the poses accepted since would have shown an error as that one claims
-    shown: float = 0.0
+    #: NIS of the poses accepted since, together, if the estimate were off as that one claims
+    would_show: float = 0.0
     #: of an alternative: poses that it must accept before it may replace the estimate
     needed: int = 0
     #: minus twice the log likelihood of its poses, up to a constant
@@ -104,12 +104,12 @@ class Hypothesis(NamedTuple):
             accepted_in_row=0,
             refused_in_row=self.refused_in_row + 1,
             against=innovation,
-            shown=0.0,
+            would_show=0.0,
         )
 
-    def staying_in_doubt(self, estimate: Estimate, shown: float) -> 'Hypothesis':
+    def staying_in_doubt(self, estimate: Estimate, would_show: float) -> 'Hypothesis':
         """The hypothesis after an accepted pose that would not have shown what the refused ones claim."""
-        return self._replace(estimate=estimate, compared_ns=estimate.stamp_ns, shown=shown)
+        return self._replace(estimate=estimate, compared_ns=estimate.stamp_ns, would_show=would_show)
 
     def with_noise(self, noise: PoseNoise) -> 'Hypothesis':
         """The hypothesis with variances of the poses' white errors as in ``noise``, not adapted to its own poses."""

@@ -19,7 +19,7 @@ from thermal_fiducial.core.filter.hypotheses import belief_after, relinearises
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
 from thermal_fiducial.core.filter.propagation import propagated, random_walks
-from thermal_fiducial.core.filter.state import clock_offset_derivative, embedded_core, SIZE, TIME_OFFSET
+from thermal_fiducial.core.filter.state import clock_offset_derivative, embedded_core, Estimate, SIZE, TIME_OFFSET
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
 from thermal_fiducial.core.geometry.se3 import screw_difference
 from thermal_fiducial.core.measurements import CameraPose
@@ -220,7 +220,27 @@ class History:
         return True
 
     def innovation(self, hypothesis: Hypothesis, pose: CameraPose) -> Innovation:
-        """Innovation of a pose against a hypothesis at its instant, never earlier than where the hypothesis is now."""
+        """Innovation of a pose against a hypothesis at its instant; of two possible poses that of the nearer one.
+
+        Where the estimate does not show which of the two it is, nothing is known of the turn between them.
+        """
+        estimate, possible = self._at_instant(hypothesis, pose), possible_poses(pose)
+        motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)
+        on_robot, scale = estimate.state.T_body_camera, self.config.pose_noise_scale
+        bodies = [body_pose(measured, on_robot, scale) for measured in possible]
+        innovations = [innovation_of(self.config, estimate, body, motion) for body in bodies]
+        nearer, *farther = sorted(innovations, key=attrgetter('nis'))
+        if farther and farther[0].nis - nearer.nis < DECISIVE:
+            between = unknown_turn(screw_difference(possible[0].T_map_camera, pose.T_map_camera))
+            unsure = body_pose(pose.widened(between), on_robot, scale)
+            return innovation_of(self.config, estimate, unsure, motion)
+        return nearer
+
+    def _at_instant(self, hypothesis: Hypothesis, pose: CameraPose) -> Estimate:
+        """The estimate of a hypothesis at the instant of a pose, widened by steps of the clocks that are suspected.
+
+        Never earlier than where the hypothesis is now.
+        """
         time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
         estimate = self.carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate
         if step_ns := self._camera_steps.get(pose.stamp_ns, 0):
@@ -230,18 +250,7 @@ class History:
                 # Time did not pass.
                 derivative = estimate.state.derivative(self.imu.at(estimate.stamp_ns))
                 estimate = estimate.widened(embedded_core(derivative), std)
-        motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)
-        on_robot, scale = estimate.state.T_body_camera, self.config.pose_noise_scale
-        possible = possible_poses(pose)
-        bodies = [body_pose(measured, on_robot, scale) for measured in possible]
-        innovations = [innovation_of(self.config, estimate, body, motion) for body in bodies]
-        nearer, *farther = sorted(innovations, key=attrgetter('nis'))
-        if farther and farther[0].nis - nearer.nis < DECISIVE:
-            # The estimate does not show which of the two it is: then nothing is known of the turn between them.
-            between = unknown_turn(screw_difference(possible[0].T_map_camera, pose.T_map_camera))
-            unsure = body_pose(pose.widened(between), on_robot, scale)
-            return innovation_of(self.config, estimate, unsure, motion)
-        return nearer
+        return estimate
 
     def carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
         """A hypothesis propagated along the samples to an instant that is not later than the newest sample."""

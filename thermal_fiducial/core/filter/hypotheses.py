@@ -106,21 +106,21 @@ def weigh(
     stale = coasted > config.reinitialise_after
     if nis <= config.gate and not stale:
         accepted, after = PoseUpdate(stamp_ns, True, '', nis), corrected(config, innovation)
-        if hypothesis.in_doubt and (shown := _shown(hypothesis, innovation)) <= config.gate:
-            return hypothesis.staying_in_doubt(after, shown), accepted
+        if hypothesis.in_doubt and (nis_if_off := _would_show(hypothesis, innovation)) <= config.gate:
+            return hypothesis.staying_in_doubt(after, nis_if_off), accepted
         return hypothesis.accepting(after), accepted
     refusing = hypothesis.refusing(replace(estimate, pose_noise=adapted_noise(innovation)), innovation.value)
     why = f'after {coasted:.0f} s without one' if stale else f'{math.sqrt(nis):.1f} sigma'
     return refusing, PoseUpdate(stamp_ns, False, f'refused: {why}', nis)
 
 
-def _shown(hypothesis: Hypothesis, innovation: Innovation) -> float:
-    """NIS that the poses accepted since the latest refused one would have together if they were off as that one.
+def _would_show(hypothesis: Hypothesis, innovation: Innovation) -> float:
+    """NIS of the poses accepted since the latest refused one, together, if the estimate were off as that one claims.
 
     Without that of its noise, which is all that a vague pose has: its mean is the number of degrees of freedom.
     """
     against = hypothesis.against
-    return hypothesis.shown + max(0.0, float(against @ innovation.S_inverse @ against) - len(against))
+    return hypothesis.would_show + max(0.0, float(against @ innovation.S_inverse @ against) - len(against))
 
 
 def _contradiction(config: PoseEkfConfig, hypothesis: Hypothesis, innovation: Innovation) -> Condition:

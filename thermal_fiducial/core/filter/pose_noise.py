@@ -71,10 +71,11 @@ class BodyPose:
         """(6, 6) its derivative by a motion of the map about its origin, in the conventions of ``covariance``."""
         return displacement_of_body(self.T_map_body)
 
-    def after(self, last: 'BodyPose', T_map_body: FloatArray) -> 'BodyPose':
-        """It as the ``last`` pose of the next one, seen from ``T_map_body`` of the estimate.
+    def as_last(self, last: 'BodyPose', T_map_body: FloatArray) -> 'BodyPose':
+        """The pose as the one that the next is compared with, seen from ``T_map_body`` of the estimate.
 
-        Of turns that it does not show, the map's error stays that of the last one; the position follows such a turn.
+        Of turns that it does not show it has no error of the map either: that of the ``last`` pose stays there, and
+        the position follows such a turn.
         """
         seen, turns = replace(self, T_map_body=T_map_body), self.covariance[:3, :3]
         if turns.trace() < _UNKNOWN_TURN**2:

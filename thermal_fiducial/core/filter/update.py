@@ -115,7 +115,7 @@ def map_jacobian(state: NavigationState) -> FloatArray:
 
 def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, motion: MotionAtPose) -> Innovation:
     """Innovation of ``pose`` against ``estimate`` at the same instant."""
-    prior = _with_markers(config, _in_view(config, estimate, pose), pose)
+    prior = _propagated_to_markers(config, _propagated_to_view(config, estimate, pose), pose)
     derivative = prior.state.derivative(motion.imu)
     H = np.zeros((6, SIZE))
     H[_SIX, POSE] = 1.0
@@ -156,14 +156,14 @@ def with_covariance(config: PoseEkfConfig, innovation: Innovation, covariance: F
 def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
     """The estimate after an accepted pose."""
     prior, before = innovation.prior, innovation.derivative
-    gain, covariance, clock = _gained(innovation)
+    gain, covariance, clock = _gain_and_covariance(innovation)
     error = _iterated(innovation, gain)
     state = prior.state.plus(error)
     if config.estimate_time_offset:
         now = state.derivative(innovation.motion.imu)
         state = state.moved((before - now) * error[TIME_OFFSET])
         covariance = _in_clock_of_imu(covariance, before - now)
-    last = innovation.pose.after(prior.pose_noise.last, state.T_map_body)
+    last = innovation.pose.as_last(prior.pose_noise.last, state.T_map_body)
     noise = replace(adapted_noise(innovation), last=last, of_map=prior.pose_noise.of_map)
     by_rotation = innovation.H @ innovation.of_extrinsics[:, :3]
     mount = prior.mount.after(by_rotation, innovation.S_exact, innovation.value)
@@ -186,31 +186,30 @@ def with_unknown_clock(config: PoseEkfConfig, covariance: FloatArray) -> FloatAr
     return covariance
 
 
-def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estimate:
+def _propagated_to_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estimate:
     """The estimate with the systematic error of poses propagated to the view of ``pose``: first-order Markov."""
     # The estimate shows better than a noisy pose how the view changes.
     seen = replace(pose, T_map_body=estimate.state.T_map_body)
-    alike = seen.correlation(estimate.pose_noise.last, config.systematic_angle)
-    share = estimate.pose_noise.lasting
-    of_view = share * config.systematic_pose_std**2 * pose.shape
+    correlation = seen.correlation(estimate.pose_noise.last, config.systematic_angle)
+    claimed = estimate.pose_noise.lasting * config.systematic_pose_std**2 * pose.shape
     P = estimate.covariance.copy()
-    stays = share_that_stays(P[SYSTEMATIC, SYSTEMATIC], of_view)
-    kept = alike * stays
+    stays = share_that_stays(P[SYSTEMATIC, SYSTEMATIC], claimed)
+    kept = correlation * stays
     P[SYSTEMATIC] = kept @ P[SYSTEMATIC]
     P[:, SYSTEMATIC] = P[:, SYSTEMATIC] @ kept.T
-    P[SYSTEMATIC, SYSTEMATIC] += of_view - alike**2 * stays @ of_view
+    P[SYSTEMATIC, SYSTEMATIC] += claimed - correlation**2 * stays @ claimed
     state = replace(estimate.state, systematic=kept @ estimate.state.systematic)
     return replace(estimate, state=state, covariance=P)
 
 
-def _with_markers(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estimate:
+def _propagated_to_markers(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estimate:
     """The estimate with the map's error propagated to the markers of ``pose``: a random walk from those of the last.
 
     The estimate goes on in the map as they have it where that is better than its own, or where little is lost by it.
     So poor markers take away nothing that it knows.
     """
     noise, P = estimate.pose_noise, estimate.covariance.copy()
-    now = pose.after(noise.last, estimate.state.T_map_body)
+    now = pose.as_last(noise.last, estimate.state.T_map_body)
     if not any(C.any() for C in (now.map_covariance, noise.of_map, P[MARKERS, MARKERS])):
         return estimate
     since_last, apart = now.map_changes(np.stack((noise.last.map_covariance, noise.of_map)))
@@ -288,7 +287,7 @@ def _clock_evidence(innovation: Innovation, by_pose: float) -> ClockEvidence:
     return innovation.prior.clock.after(information, spurious)
 
 
-def _gained(innovation: Innovation) -> tuple[FloatArray, FloatArray, ClockEvidence]:
+def _gain_and_covariance(innovation: Innovation) -> tuple[FloatArray, FloatArray, ClockEvidence]:
     """Kalman update: the gain (54, 6), the covariance (54, 54), and what is known of the clock offset.
 
     The gain is that of exact extrinsics, so the estimate does not depend on how well they are said to be known; the

@@ -102,12 +102,12 @@ def test_of_turns_that_a_pose_does_not_show_the_error_of_the_map_stays():
     about_z = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
     last = BodyPose(T, rest, 0.05**2 * np.outer(about_z, about_z))
     now = BodyPose(T, rest + NOTHING_KNOWN**2 * np.outer(turn, turn), 1e-4 * np.diag([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))
-    kept = now.after(last, T).map_covariance
+    kept = now.as_last(last, T).map_covariance
     np.testing.assert_allclose(kept[5, 5], 0.05**2, rtol=1e-3)
     # About the origin, which the turn leaves where it is, and of all else it is that of the pose itself.
     np.testing.assert_allclose(kept[:3, :3], 1e-4 * np.eye(3), rtol=1e-3, atol=1e-9)
     shown = replace(now, covariance=rest)
-    np.testing.assert_array_equal(shown.after(last, T).map_covariance, now.map_covariance)
+    np.testing.assert_array_equal(shown.as_last(last, T).map_covariance, now.map_covariance)
 
 
 def test_time_offset_and_extrinsics_columns(estimate, motion):
