@@ -19,7 +19,7 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 INLIER = 3.0
 # Turn [rad] at which a step of a square's pose leaves as much of the cost as it takes away: less than of nineteen in
 # twenty steps on rendered frames, whose median is 0.17 to 0.66.
-_LINEAR = 0.1
+_LINEAR_ANGLE = 0.1
 # Ratio of the squared errors of a marker's two poses beyond which the image rules out the worse one.
 _AMBIGUOUS = 10.0
 # Step of the differences for the derivatives of outlines [px]: a millionth of a side, far above rounding.
@@ -73,7 +73,7 @@ def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArra
     once, points = Images.of(corners, whitening(corner_covs)), marker_corners(sizes[twice])
     images = Images(once.whitening[twice], once.target[twice])
     starts = ippe_square(corners.x, sizes).reshape(-1, 4, 4)
-    T, cost, _ = minimise(starts, lambda T: evaluate(T, points, images), alternatives=2, linear=_LINEAR)
+    T, cost, _ = minimise(starts, lambda T: evaluate(T, points, images), alternatives=2, linear_angle=_LINEAR_ANGLE)
     p = se3.apply(T, points)
     residuals = (corners.x[twice] - p[..., :2] / p[..., 2:])[..., None]
     chi2, squared_px = (((W @ residuals) ** 2).sum(axis=(1, 2, 3)) for W in (images.whitening, corners.J[twice]))

@@ -62,7 +62,7 @@ class Images:
 
 
 def minimise(
-    T: FloatArray, evaluated: Callable[[FloatArray], Quadratic], alternatives: int = 1, linear: float = TINY
+    T: FloatArray, evaluated: Callable[[FloatArray], Quadratic], alternatives: int = 1, linear_angle: float = TINY
 ) -> Quadratic:
     """Poses with the least costs, from starts ``T`` (B, 4, 4).
 
@@ -71,8 +71,9 @@ def minimise(
     evaluated : function of poses: cost, half its gradient and half its Gauss-Newton Hessian, for steps of the origin
         and rotations about it, both in the parent frame
     alternatives : number of consecutive starts of the same body, of which only the best is needed
-    linear : rotation [rad] after which as much of the cost is still to be gained as the step has gained. After a step
-        by an angle a it is taken for ``gain * min((a / linear)**2, 1)``; the search ends where that is negligible
+    linear_angle : rotation [rad] of a step after which as much of the cost is still to be gained as it has gained: the
+        step ends where the cost is no longer quadratic. After one by an angle a the rest is taken for
+        ``gain * min((a / linear_angle)**2, 1)``; the search ends where that is negligible
 
     Returns
     -------
@@ -90,8 +91,8 @@ def minimise(
         step = _solve(information, damping, gradient)
         best = np.repeat(cost.reshape(-1, alternatives).min(axis=1), alternatives)
         gain = (step * gradient).sum(axis=1)
-        bent = np.minimum((step[:, 3:] * step[:, 3:]).sum(axis=1) / linear**2, 1.0)
-        last = gain * bent < _LITTLE * np.maximum(cost - np.minimum(best, _REFUTED), 1.0)
+        left_share = np.minimum((step[:, 3:] * step[:, 3:]).sum(axis=1) / linear_angle**2, 1.0)
+        last = gain * left_share < _LITTLE * np.maximum(cost - np.minimum(best, _REFUTED), 1.0)
         most = _REFUTED + _TIMES_THE_BEST * best
         if steps > 0:
             active = active & (damping <= MOST_DAMPED) & (cost <= most)
@@ -103,8 +104,8 @@ def minimise(
             break
         new = evaluated(trial)
         better = active & (new[0] <= cost)
-        for mine, its in zip((T, cost, gradient, information), (trial, *new), strict=True):
-            mine[better] = its[better]
+        for kept, tried in zip((T, cost, gradient, information), (trial, *new), strict=True):
+            kept[better] = tried[better]
         damping *= np.where(better, EASED, STIFFENED)
     return T, np.where(possible, cost, np.inf), information
 
