@@ -166,18 +166,19 @@ def _fit(X: Float32Array, segments: int) -> _SegmentFit:
     number = sums[0]
     means = sums[:4] / np.maximum(number, 1.0)
     # Without their means the columns leave two unknowns.
-    a, b, p, c, q, square = sums[4:] - sums.take(_FIRST, axis=0) * means.take(_SECOND, axis=0)
+    # Sums of the products of model m, derivative d and counts y.
+    mm, md, my, dd, dy, yy = sums[4:] - sums.take(_FIRST, axis=0) * means.take(_SECOND, axis=0)
     ridge = _RIDGE * (number + 1.0)
-    a += ridge
-    c += ridge
-    determinant = a * c - b * b
-    contrast, product = (c * p - b * q) / determinant, (a * q - b * p) / determinant
-    own = np.maximum(square - contrast * p - product * q, 0.0) / np.maximum(number - 3.0, 1.0)
+    mm += ridge
+    dd += ridge
+    determinant = mm * dd - md * md
+    contrast, product = (dd * my - md * dy) / determinant, (mm * dy - md * my) / determinant
+    own = np.maximum(yy - contrast * my - product * dy, 0.0) / np.maximum(number - 3.0, 1.0)
     level = means[3] - contrast * means[1] - product * means[2]
     usable: BoolArray = np.asarray(number >= _FEWEST_PIXELS)
     typical = median_of(own, usable)
     noise = np.where(own > _NOISIER * typical, own, typical) + TINY
-    return _SegmentFit(contrast, product, c / determinant, a / determinant, level, usable, noise)
+    return _SegmentFit(contrast, product, dd / determinant, mm / determinant, level, usable, noise)
 
 
 def _judged(fit: _SegmentFit, reach: FloatArray) -> Segments:

@@ -11,12 +11,7 @@ import numpy as np
 
 from thermal_fiducial.core.detection.prediction.frame import LEAST_DEPTH
 from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers
-from thermal_fiducial.core.detection.prediction.twist import (
-    corrected,
-    Twist,
-    twist_by_odometry,
-    UNKNOWN_TWIST,
-)
+from thermal_fiducial.core.detection.prediction.twist import Twist, twist_by_odometry, UNKNOWN_TWIST, updated
 from thermal_fiducial.core.error_model import UNKNOWN_ACCELERATION
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import interaction
@@ -103,8 +98,9 @@ class MotionTrack:
         dt = self._since(stamp_ns)
         if len(now) == 0 or dt is None:
             return predicted
-        begin, end = dt + (self.lag if self.twist is None else 0.0), self.lag if predicted is None else 0.0
-        seconds, start = begin - end, predicted or UNKNOWN_TWIST
+        # Corners of a frame without a twist still lag: they are where they were one time constant before it.
+        from_ago, to_ago = dt + (self.lag if self.twist is None else 0.0), self.lag if predicted is None else 0.0
+        seconds, start = from_ago - to_ago, predicted or UNKNOWN_TWIST
         x, x_before = corners.x[now], self.markers.x[before]
         A = interaction(0.5 * (x + x_before), corners.depth[now]).reshape(-1, 6)
         velocity = (x - x_before).reshape(-1) / seconds
@@ -116,9 +112,9 @@ class MotionTrack:
         spread = weighted @ stretch
         share = spread / (1.0 + stretched @ stretch)
         information = weighted @ A - spread[:, None] * share
-        later = -0.5 * (begin + end)
-        value = weighted @ velocity - share * (stretched @ velocity)
-        return corrected(start, information, value, later, later + self.lag)
+        information_times_twist = weighted @ velocity - share * (stretched @ velocity)
+        middle_ago = 0.5 * (from_ago + to_ago)
+        return updated(start, information, information_times_twist, middle_ago, self.lag - middle_ago)
 
     def explains(self, stamp_ns: int, predicted: Twist | None, corners: MeasuredCorners) -> BoolArray:
         """Which markers (N,) were in the last frame, and have moved since as the twist allows.

@@ -27,7 +27,7 @@ class Twist:
     Parameters
     ----------
     value : (6,) v [m/s], omega [rad/s] at a frame's stamp
-    covariance : (6, 6) of the twist that blurs the frame, one time constant of the bolometers before
+    covariance : (6, 6) of the twist that blurs the frame: the one a time constant of the bolometers before the stamp
     acceleration, acceleration_covariance : (6,), (6, 6)
     """
 
@@ -62,22 +62,23 @@ def twist_by_odometry(
     values = np.concatenate(parts).reshape(-1, 6) @ transfer.T
     t = np.array([(state.stamp_ns - stamp_ns) / SECOND_NS for state in odometry])
     middle = float(t.sum()) / len(t)
-    off = t - middle
+    from_middle = t - middle
     typical = np.asarray(sum(state.twist_covariance for state in odometry) / len(t))
     noise = _LEAST.copy()
     noise[3:, 3:] += transfer[3:, 3:] @ typical[3:, 3:] @ transfer[3:, 3:].T
-    # Of few or noisy states the acceleration is hardly known: its prior is UNKNOWN_ACCELERATION.
-    known = float(off @ off) + noise.diagonal() / UNKNOWN_ACCELERATION.diagonal()
-    acceleration, unsure = off @ values / known, noise / known + float(t[-1] - t[0]) * _CHANGES
+    # The slope of the line. Of few or noisy states it is hardly known: its prior is UNKNOWN_ACCELERATION.
+    squares = float(from_middle @ from_middle) + noise.diagonal() / UNKNOWN_ACCELERATION.diagonal()
+    acceleration = from_middle @ values / squares
+    acceleration_covariance = noise / squares + float(t[-1] - t[0]) * _CHANGES
     # In all coordinates, as the rate's noise is in the velocity of a camera with a lever arm, too.
-    averaged = transfer * ([1.0] * 3 + [1.0 / math.sqrt(len(t))] * 3)
-    covariance = averaged @ typical @ averaged.T + (middle + lag) ** 2 * unsure + _LEAST
+    of_mean = transfer * ([1.0] * 3 + [1.0 / math.sqrt(len(t))] * 3)
+    covariance = of_mean @ typical @ of_mean.T + (middle + lag) ** 2 * acceleration_covariance + _LEAST
     covariance += clock_std_s**2 * UNKNOWN_ACCELERATION
-    return Twist(values.sum(axis=0) / len(t) - middle * acceleration, covariance, acceleration, unsure)
+    return Twist(values.sum(axis=0) / len(t) - middle * acceleration, covariance, acceleration, acceleration_covariance)
 
 
-def corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later: float, apart: float) -> Twist:
-    """Twist after a measurement of its value ``later`` seconds after the stamp, in information form.
+def updated(twist: Twist, information: FloatArray, weighted: FloatArray, ago: float, apart: float) -> Twist:
+    """Twist after a measurement of its value ``ago`` seconds before the stamp, in information form.
 
     The Kalman update ``P - P inv(I + W (P + Q)) W P`` for an information W that need not be invertible, with the
     uncertainty Q of what the acceleration has changed meanwhile.
@@ -89,7 +90,7 @@ def corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later
     """
     P = twist.covariance
     S = _EYE + information @ (P + apart**2 * twist.acceleration_covariance)
-    residual = weighted - information @ twist.ago(-later)
+    residual = weighted - information @ twist.ago(ago)
     change = P @ np.linalg.solve(S, np.concatenate([information @ P, residual[:, None]], axis=1))
     P = P - change[:, :6]
     # Symmetric: rounding errors would add up over the frames.
