@@ -140,7 +140,7 @@ class MarkerDetector:
         found_ids = rows['id'].astype(np.int64)
         candidates = self._known.partially_visible(guide.T_camera_map, frame.camera, found_ids)
         position_std_m = math.sqrt(np.trace(guide.covariance[:3, :3]))
-        ids, corners = self._partial.look(frame, gray_scale, candidates, position_std_m, self.config)
+        ids, corners = self._partial.find(frame, gray_scale, candidates, position_std_m, self.config)
         if len(ids) == 0:
             return rows
         points = ImagePoints.at(corners.corners_px, frame.camera)

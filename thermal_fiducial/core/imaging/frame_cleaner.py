@@ -51,7 +51,7 @@ class CleanFrame:
     late: bool = False
 
 
-def _pixels(listed: IntArray) -> IntArray:
+def _checked_pixels(listed: IntArray) -> IntArray:
     """``listed`` as integers (N, 2)."""
     pixels = np.asarray(listed)
     if pixels.ndim != 2 or pixels.shape[1] != 2 or pixels.dtype.kind not in 'iu':
@@ -75,7 +75,7 @@ class FrameCleaner:
 
     def __init__(self, config: Tau2CameraConfig, bad_pixels: IntArray | None = None) -> None:
         self.config = config
-        self._known_bad = _pixels(np.zeros((0, 2), np.int64) if bad_pixels is None else bad_pixels)
+        self._known_bad = _checked_pixels(np.zeros((0, 2), np.int64) if bad_pixels is None else bad_pixels)
         self._telemetry_on_top = 0
         #: shift of the counts; frames in a row that show carries into the bits that are masked otherwise, as those of a
         #: radiometric camera, which fills all 16: after a few of them frames without carries are believed too

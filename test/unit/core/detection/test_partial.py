@@ -58,7 +58,7 @@ def look_at(frame, T_expected, marker_id=ID, config=CONFIG, scale=UNKNOWN_SCALE)
     known = KnownMarkers({marker_id: (T_expected, SIZE)}, np.ones(len(BITS)))
     cut = known.partially_visible(np.eye(4), camera, np.zeros(0, dtype=np.int64))
     assert len(cut) == 1
-    return SEARCH.look(frame, scale, cut, 0.01, config)
+    return SEARCH.find(frame, scale, cut, 0.01, config)
 
 
 def disturbed(T, rng, scale=0.005):

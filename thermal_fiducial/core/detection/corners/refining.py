@@ -96,11 +96,11 @@ def refine(
         blur, before = motion_blur(frame, places, twist), gray_scale
         start = places.points.at_pixels(places.points.px + blur.shift)
         bent = frame.displayed and blur.to_tails is not None
-        shown = frame.in_counts(gray_scale.counts) if bent else frame
-        refined = _measured(shown, found, start, blur, columns, decoder, rough)
+        in_counts = frame.in_counts(gray_scale.counts) if bent else frame
+        refined = _measured(in_counts, found, start, blur, columns, decoder, rough)
         markers = _at_stamp(frame, found.ids, places, blur, refined, twist, track, decoder.cells)
         if bent:
-            gray_scale = _shown_scale(frame, gray_scale, markers, start, decoder)
+            gray_scale = _estimated_scale(frame, gray_scale, markers, start, decoder)
         change = np.abs(markers.corners.corners_px - refined.corners_px + blur.shift)
         settled = change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX and not (bent and gray_scale.differs(before))
         if markers.twist is None or settled:
@@ -111,7 +111,7 @@ def refine(
     return markers, gray_scale
 
 
-def _shown_scale(
+def _estimated_scale(
     frame: Frame, before: GrayScale, markers: RefinedMarkers, start: ImagePoints, decoder: Decoder
 ) -> GrayScale:
     """The gray scale of the display that markers show, which were looked for at ``start`` (N, 4)."""
@@ -144,11 +144,11 @@ def _measured(
         whole |= ~rough
     if whole.all():
         return _by_patterns(frame, found, start, blur, decoder)
-    others, of_sides = (start.only(~whole), blur.only(~whole)) if whole.any() else (start, blur)
+    corners, of_sides = (start.only(~whole), blur.only(~whole)) if whole.any() else (start, blur)
     # On displays sides are where fits of patterns begin.
     passes = 1 if frame.displayed else PASSES
     image = frame.pixels if blur.to_tails is None else frame.image
-    refined = refine_corners(image, others, frame.camera, decoder.cells, frame.blur_px, columns, of_sides, passes)
+    refined = refine_corners(image, corners, frame.camera, decoder.cells, frame.blur_px, columns, of_sides, passes)
     if frame.displayed:
         # Fits of large patterns do not converge from corners that are off by half a cell.
         px = start.px.copy()
@@ -157,7 +157,7 @@ def _measured(
     if not whole.any():
         return refined
     fitted = _by_patterns(frame, found.only(whole), start.only(whole), blur.only(whole), decoder)
-    return refined.joined(fitted).only(_places(whole))
+    return refined.joined(fitted).only(_original_order(whole))
 
 
 def _by_patterns(
@@ -171,15 +171,15 @@ def _by_patterns(
     saturation = None if blur.to_tails is None else frame.saturation
     for nearer in np.unique(near):
         which = near == nearer
-        there, moving = start.only(which), blur.only(which)
-        bends = lens_bends(there, frame.camera)
+        corners, moving = start.only(which), blur.only(which)
+        bends = lens_bends(corners, frame.camera)
         view = PatternView(frame.image, moving.to_tails, moving.spread, None, frame.displayed, bends, saturation)
-        fitted = fitted_patterns(frame, found.only(which), there, moving.rolling, view, nearer, decoder)
+        fitted = fitted_patterns(frame, found.only(which), corners, moving.rolling, view, nearer, decoder)
         refined = refined.joined(fitted)
-    return refined.only(_places(near))
+    return refined.only(_original_order(near))
 
 
-def _places(groups: BoolArray | IntArray) -> IntArray:
+def _original_order(groups: BoolArray | IntArray) -> IntArray:
     """Where each of N items of some ``groups`` (N,) is in a batch that has these one after the other, (N,)."""
     return np.argsort(np.argsort(groups, kind='stable'))
 

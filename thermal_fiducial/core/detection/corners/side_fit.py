@@ -101,15 +101,15 @@ def refine_corners(
     modelled = model(sides, blur, inside, outside)
     # No farther than columns reach.
     outward = np.minimum(outside, (len(sides.distance) // 2) * np.abs(sides.normal).max(axis=2))
-    measured, displaced_px = _measured(counts, modelled, sides, blur, outward, motion_px)
-    segments, shows = with_gradients(measured, sides, widest)
+    measured, displaced_px = _with_even_contrast(counts, modelled, sides, blur, outward, motion_px)
+    segments, gradient_shows = with_gradients(measured, sides, widest)
     square = as_squares(corners.at_pixels(corners.px - motion.rolling), *adjust(sides, segments))
-    refined, moving = _moved(sides, segments, square, displaced_px)
+    refined, moving = _adjusted(sides, segments, square, displaced_px)
     if passes == 1:
         return refined
     ending = ending_sides(counts, modelled, sides, measured, outward, blur.across, motion_px)
     shifts = refined.corners_px - corners.px
-    which, reach = _again(moving, shows, ending, shifts, reach, outward, blur.across)
+    which, reach = _to_repeat(moving, gradient_shows, ending, shifts, reach, outward, blur.across)
     if len(which) == 0:
         return refined
     start = corners.only(which).at_pixels(refined.corners_px[which])
@@ -118,9 +118,9 @@ def refine_corners(
     return refined
 
 
-def _again(
+def _to_repeat(
     moving: BoolArray,
-    shows: BoolArray,
+    gradient_shows: BoolArray,
     ending: BoolArray,
     shifts: FloatArray,
     reach: FloatArray,
@@ -133,21 +133,21 @@ def _again(
 
     Parameters
     ----------
-    moving, shows, ending : of :func:`_moved`, :func:`with_gradients` and :func:`ending_sides`
+    moving, gradient_shows, ending : of :func:`_adjusted`, :func:`with_gradients` and :func:`ending_sides`
     shifts : (N, 4, 2) displacement of the corners [px]
     outward, width : of :func:`ending_sides`
     """
-    shows = shows & ~moving
+    gradient_shows = gradient_shows & ~moving
     if ending.any():
         ending = ending & (np.abs(shifts).max(axis=(1, 2)) < _SETTLED_PX[1])[:, None]
-    if shows.any() or ending.any():
+    if gradient_shows.any() or ending.any():
         is_near = np.isfinite(reach[:, 0]).any(axis=1)
-        moving = moving | (shows & ~is_near) | ending.any(axis=1)
-        reach = nearer(reach, shows, ending, outward, width)
+        moving = moving | (gradient_shows & ~is_near) | ending.any(axis=1)
+        reach = nearer(reach, gradient_shows, ending, outward, width)
     return moving.nonzero()[0], reach
 
 
-def _measured(
+def _with_even_contrast(
     counts: Float32Array,
     modelled: EdgeModel,
     sides: Sides,
@@ -167,17 +167,17 @@ def _measured(
     return segments, displaced_px
 
 
-def _moved(
-    sides: Sides, segments: Segments, known: Squared, displaced_px: FloatArray
+def _adjusted(
+    sides: Sides, segments: Segments, square: Squared, displaced_px: FloatArray
 ) -> tuple[RefinedCorners, BoolArray]:
     """Corners after one linearised adjustment, and which of the markers (N,) have not converged."""
-    covariances = known.corner_covariances + OF_ALL_SIDES_PX**2 * _EYE
+    covariances = square.corner_covariances + OF_ALL_SIDES_PX**2 * _EYE
     # In an outline that is inconsistent with a square, some side belongs to another object.
-    doubt = known.doubt * (sides.along.reshape(-1, 4).sum(axis=1) / 4) ** 2
+    doubt = square.doubt * (sides.along.reshape(-1, 4).sum(axis=1) / 4) ** 2
     good = segments.variance < UNMEASURED
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]
     contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))
-    shift, deviation = known.moved.reshape(-1, 4, 2), np.sqrt(covariances.diagonal(axis1=2, axis2=3))
+    shift, deviation = square.moved.reshape(-1, 4, 2), np.sqrt(covariances.diagonal(axis1=2, axis2=3))
     least, most = _SETTLED_PX
     settled = np.minimum(np.maximum(_UNSURE * deviation, least), most)
     moving: BoolArray = np.asarray((np.abs(shift) > settled).any(axis=(1, 2)))

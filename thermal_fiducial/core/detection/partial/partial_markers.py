@@ -81,7 +81,7 @@ class PartialMarkerSearch:
         self._bits, self._cells = bits, decoder.cells
         self._visible = VisibleCells(decoder)
 
-    def look(
+    def find(
         self,
         frame: Frame,
         gray_scale: GrayScale,
@@ -98,23 +98,23 @@ class PartialMarkerSearch:
         gray_scale : of the display, as far as whole markers have shown it; counts have none
         unsure_m : standard deviation of the predicted camera position [m]
         """
-        in_view = (self._expected(frame.camera, key, size, T, unsure_m) for key, T, size in candidates)
+        in_view = (self._predicted(frame.camera, key, size, T, unsure_m) for key, T, size in candidates)
         largest = sorted((marker for marker in in_view if marker is not None), key=lambda marker: -marker.cell_px)
         if frame.displayed and largest:
             frame = frame.in_counts(gray_scale.counts)
         ids, found = list[int](), RefinedCorners.none()
         for marker in largest[:_MOST]:
-            corners = self._one(frame, marker, config)
+            corners = self._refined(frame, marker, config)
             if corners is not None:
                 ids, found = [*ids, marker.id], found.joined(corners)
         return np.array(ids, dtype=np.int64), found
 
-    def _one(self, frame: Frame, marker: _PartialMarker, config: ArucoDetectorConfig) -> RefinedCorners | None:
+    def _refined(self, frame: Frame, marker: _PartialMarker, config: ArucoDetectorConfig) -> RefinedCorners | None:
         """Corners of a marker by a fit at low, then at full resolution; None if it does not show its pattern."""
         points = on_marker(self._visible.places, marker.size)
         factor = int(2 ** np.clip(np.floor(np.log2(marker.cell_px / _COARSE_PX)), 0, 3))
         coarse = layer_of(frame, marker.window_in_camera(), factor)
-        T = self._moved(marker, points, coarse, marker.cell_px / factor)
+        T = self._aligned(marker, points, coarse, marker.cell_px / factor)
         if T is None:
             return None
         pattern = grid_edges(self._bits[marker.id])
@@ -134,7 +134,7 @@ class PartialMarkerSearch:
             return None
         return _corners(frame, marker, fit)
 
-    def _expected(
+    def _predicted(
         self, camera: Camera, marker_id: int, size: float, T_camera_marker: FloatArray, unsure_m: float
     ) -> _PartialMarker | None:
         """The prediction of a marker with its visible part; None if that is too small."""
@@ -153,7 +153,7 @@ class PartialMarkerSearch:
         window = np.array([[left, top], [right_end, top], [right_end, bottom], [left, bottom]])
         return _PartialMarker(marker_id, size, T_camera_marker, window, cell_px, unsure_m * self._cells / size)
 
-    def _moved(self, marker: _PartialMarker, points: FloatArray, layer: Layer, cell_px: float) -> FloatArray | None:
+    def _aligned(self, marker: _PartialMarker, points: FloatArray, layer: Layer, cell_px: float) -> FloatArray | None:
         """The predicted pose (4, 4), translated to the best correlation of the pattern; None without any."""
         px = layer.project(se3.apply(marker.T_camera_marker, points))
 
@@ -163,7 +163,7 @@ class PartialMarkerSearch:
         at, near = np.zeros(2), cell_px * NEAR_CELLS
         similarity = similar(near)
         if similarity.max() < _SIMILAR:
-            far = cell_px * _around(marker.unsure_cells)
+            far = cell_px * _offsets_around(marker.unsure_cells)
             at = far[np.argmax(similar(far))]
             similarity = similar(at + near)
         if similarity.max() < _HINT:
@@ -181,7 +181,7 @@ class PartialMarkerSearch:
         return rough.contrast * np.sign(correlation) if abs(correlation) >= _ALIKE else 0.0
 
 
-def _around(unsure_cells: float) -> FloatArray:
+def _offsets_around(unsure_cells: float) -> FloatArray:
     """Places (P, 2) round one that is known so well, in cells."""
     steps = min(round(_UNSURE * unsure_cells / _APART), _MOST_STEPS)
     along = _APART * np.arange(-steps, steps + 1)
