@@ -47,8 +47,8 @@ class SystematicErrors:
     #: begin with, and at most, as measured on rendered flights with three lenses and 0.5 to 9 K; learned in flight from
     #: residuals that last (``CornerBias``). Enters the covariance of a joint adjustment.
     marker_shape: float = 0.7
-    #: The most likely size of ``corner_px`` [px], which is the root of a mean: by it a marker's residuals are unusual.
-    #: Enters weights of markers.
+    #: The most likely size of what ``corner_px`` is the root mean square of [px]: residuals of a marker are compared
+    #: with it. Enters weights of markers.
     likely_corner_px: float = corner_px
     #: What an adjustment of the map has found of the aspect ratio's error, as a share of the declared one, and (K,)
     #: joint draws of what it leaves, None before any. Corners are corrected by it before they enter anything.
@@ -85,7 +85,7 @@ UNKNOWN_ACCELERATION = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2
 DRAWS = 64
 #: Those of a marker whose place is known exactly.
 NO_DRAWS: FloatArray = np.zeros((6, DRAWS))
-#: Smallest part of the largest standard deviation of a marker's error that a common error is compared with.
+#: Directions in which a marker's error is smaller than this share of its largest standard deviation inherit nothing.
 _LEAST_STD = 1e-6
 
 
@@ -194,11 +194,16 @@ def assumed_draws(positions: FloatArray, covariances: FloatArray, placed: BoolAr
 
 
 def draws_of(covariance: FloatArray, rng: np.random.Generator, inherited: FloatArray = NO_DRAWS) -> FloatArray:
-    """Draws (6, K) of an error of just this ``covariance``, with as much of the ``inherited`` ones as it allows."""
+    """Draws (6, K) of an error whose covariance by these draws is just ``covariance`` (6, 6).
+
+    They are the ``inherited`` draws (6, K) where these are no larger than that, and draws of its own for the rest.
+    """
     root = covariance_root(covariance)
+    # In units of the covariance, along axes in which what is inherited is uncorrelated.
     whitened = np.linalg.pinv(root, _LEAST_STD) @ inherited / np.sqrt(DRAWS)
     axes, stds, shared = np.linalg.svd(whitened, full_matrices=False)
     stds = np.minimum(stds, 1.0)[:, None]
+    # Uncorrelated with what is inherited, so that the squares of both shares add up to one.
     own = np.linalg.qr(np.concatenate([shared, rng.standard_normal(shared.shape)]).T)[0].T[6:]
     return np.asarray(np.sqrt(DRAWS) * root @ axes @ (stds * shared + np.sqrt(1.0 - stds**2) * own))
 
@@ -248,10 +253,10 @@ def map_weights(noise: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def survey_for_weights(of_survey: FloatArray, noise: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Covariances (N, 8, 8) of corners by errors of a survey, as weights need them beside the corners' noise alone.
+    """Covariances (N, 8, 8) of corners by errors of a survey, reduced for weights that leave out the corners' bias.
 
-    Weights have no bias of the corners, as all markers have the same. It counts beside an error that each has for
-    itself: the survey's variance is divided by as much as the bias would add to the noise.
+    The bias is the same for all markers, so that alone it changes no weight. Beside it the error that each marker has
+    for itself matters less: its variance is divided by the ratio in which the bias would increase that of the noise.
 
     Parameters
     ----------
@@ -262,7 +267,7 @@ def survey_for_weights(of_survey: FloatArray, noise: FloatArray, errors: Systema
 
 
 def decision_weights(noise: FloatArray, by_readout: FloatArray) -> FloatArray:
-    """Factors (N,) on weights of markers that add the bias for decisions, and what is not known of the readout time.
+    """Factors (N,) on weights of markers by noise alone, after which bias and unknown readout time count in them, too.
 
     Parameters
     ----------

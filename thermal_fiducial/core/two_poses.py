@@ -25,23 +25,26 @@ _LARGEST_HALF = math.pi / 2.0
 
 
 def mean_of_two(mean: CameraPose, half: FloatArray, likelier: CameraPose) -> CameraPose:
-    """The ``mean`` of two poses, at the covariance that each has there, with both in its covariance.
+    """The mean of two poses whose covariance contains both; the ``likelier`` one if the two are not apart.
 
-    If the two are not apart, it is the ``likelier`` one, which knows nothing of turns across the line of sight: from
-    the front the corners do not show about which axis the marker is turned.
+    That one claims to know nothing of turns across the line of sight: from the front the corners do not show about
+    which axis the marker is turned.
 
     Parameters
     ----------
+    mean : halfway between the two, with the covariance that each has by itself
     half : (6,) screw from the mean to one of the two, in the map [m, rad]; the other one is as far on the other side
     """
     turn = half[3:]
     squared = float(turn @ turn)
-    own = float(turn @ (mean.covariance - mean.map_covariance)[3:, 3:] @ turn) / squared
-    apart = squared >= max(VAGUE**2, _CLEARLY_APART**2 * own)
+    variance = float(turn @ (mean.covariance - mean.map_covariance)[3:, 3:] @ turn) / squared
+    apart = squared >= max(VAGUE**2, _CLEARLY_APART**2 * variance)
     pose = mean if apart else likelier
     ends = (difference(screwed(mean.T_map_camera, step), pose.T_map_camera) for step in (half, -half))
     spread = 0.5 * sum(map(covariance_of_one_error, ends))
     if not apart:
+        # The marker is on the axis of the screw. The other unknown turn is about the axis through the marker that is
+        # across this one and the line of sight.
         to_axis = np.cross(turn, half[:3]) / squared
         across = np.cross(turn, to_axis) / np.linalg.norm(to_axis)
         to_pose = lever_arm(pose.T_map_camera[:3, 3] - mean.T_map_camera[:3, 3])
@@ -53,11 +56,11 @@ def mean_of_two(mean: CameraPose, half: FloatArray, likelier: CameraPose) -> Cam
 def possible_poses(pose: CameraPose) -> list[CameraPose]:
     """The pose, or the two that it is the mean of if these are apart.
 
-    Along the turn from the one to the other the covariance of the mean has the square of its half. What each is
-    uncertain by there is not in it apart; it is about as much as about the axis across, as the outline of a square
-    changes alike with both. Of the distance to the marker they claim as little as the mean. The camera moves about the
-    marker as it turns: a pose whose position does not go with the turn, of a robot that does not know its heading say,
-    is one that is uncertain.
+    The largest variance of the mean's attitude is about the axis of the turn between the two: the square of half of
+    that turn, and the variance of each pose. The latter is taken to be as large as about the axis across, since the
+    outline of a square changes alike with both. Of the distance to the marker both claim as little as the mean. The
+    camera moves about the marker as it turns: a pose whose position does not go with the turn, say of a robot that does
+    not know its heading, is a single one that is uncertain.
     """
     own = pose.covariance - pose.map_covariance
     if own[3:, 3:].trace() <= VAGUE**2:

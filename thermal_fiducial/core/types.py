@@ -31,7 +31,7 @@ class Stacked:
     """A batch of N items: arrays and batches among the fields have N entries, other fields are common to all."""
 
     def only(self, keep: BoolArray | IntArray) -> Self:
-        """The items at ``keep``."""
+        """Some of the items, by a mask (N,) or by their places."""
         return self._changed(lambda values: values[keep])
 
     def joined(self, others: Self) -> Self:

@@ -104,7 +104,7 @@ class BodyPose:
         return math.exp(-(turned + moved) / angle + log_overlap(last.shape, self.shape))
 
     def map_changes(self, others: FloatArray) -> FloatArray:
-        """Covariances (n, 6, 6) of the motions from the map errors of covariances ``others`` (n, 6, 6) to that of it.
+        """Covariances (n, 6, 6) of motions of the map from errors of covariances ``others`` (n, 6, 6) to this pose's.
 
         The least motion that makes one of the other (optimal transport of Gaussians; I. Olkin, F. Pukelsheim, "The
         distance between two random vectors with given dispersion matrices", 1982): the same markers have the same

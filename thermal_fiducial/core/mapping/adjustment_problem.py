@@ -135,7 +135,7 @@ class Linearised:
     state: Poses
     r: FloatArray
     J: FloatArray
-    #: (n, 6, 6) transposed: displacement of the marker of a view that looks like one of its camera
+    #: (n, 6, 6), transposed: from a displacement of a view's camera to the one of its marker that looks the same
     to_camera: FloatArray
     #: (F, 6, 6) how the keyframes' poses by odometry follow the pose of its frame
     J_odometry: FloatArray

@@ -104,10 +104,11 @@ def _error_sources(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> 
 
 
 def _with_weight_of_aspect(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> MapProblem:
-    """The problem with that information of the aspect ratio's prior by which the estimate is nearest to the error.
+    """The problem with a prior of the aspect ratio so strong that the estimate comes nearest to the true error.
 
-    The smooth error of the lens and the markers' shapes look like one, too. So the information is not one, but what the
-    joint draws of all of them say. It stays one where these do not exist.
+    The smooth error of the lens and the markers' shapes look like an error of the aspect ratio, too. So its
+    information is not that of the declared error, 1, but follows from all of them. It stays 1 where the equations are
+    singular.
     """
     sources = _error_sources(problem, snapshot, now)
     if sources is None:

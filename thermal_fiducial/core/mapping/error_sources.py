@@ -73,7 +73,7 @@ class ErrorSources:
         return MapErrors(covariances, draws[:-1], aspect - found[0], float(np.sqrt(np.mean(found[1] ** 2))))
 
     def variance_of_aspect(self) -> float:
-        """Of what is estimated of the aspect ratio's error, by noise and all other errors, itself among these."""
+        """Variance of the estimate of the aspect ratio's error, by noise and systematic errors, this one included."""
         problem, now, moved, covariance = self.problem, self.now, self.system.moved, self.system.covariance
         of_cameras = np.swapaxes(now.to_camera, -1, -2) @ moved.frames[problem.frame]
         by_common = problem.J_common - now.J @ (moved.nodes[problem.marker] + of_cameras)

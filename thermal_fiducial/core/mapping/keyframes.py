@@ -248,7 +248,7 @@ class KeyframeStore:
         if predicted is None:
             return frame
         information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
-        rates = _sure(*rates_of_rows(observed, predicted))
+        rates = _where_known(*rates_of_rows(observed, predicted))
         return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information, rates=rates)
 
     def _carry_over(self, before: Camera, now: Camera) -> None:
@@ -293,7 +293,7 @@ class KeyframeStore:
         return cells
 
 
-def _sure(rates: FloatArray, covariances: FloatArray) -> FloatArray:
+def _where_known(rates: FloatArray, covariances: FloatArray) -> FloatArray:
     """Rates (k, 4, 2) of a frame, zero where odometry does not know its velocity."""
     known = np.sum(rates**2) > _SURE**2 * np.trace(covariances, axis1=-2, axis2=-1).sum()
     return rates if known else np.zeros_like(rates)

@@ -114,7 +114,7 @@ class _Prior(NamedTuple):
     blur_px: float
 
     def normal_equations(self, residuals: PatternResiduals) -> tuple[FloatArray, FloatArray]:
-        """With it, (Q, K, K), (Q, K, 1), for samples with a variance of 1."""
+        """Those of the residuals and the prior together, (Q, K, K) and (Q, K, 1), for samples with a variance of 1."""
         precision, off = self._precision(residuals), np.zeros(residuals.J.shape[:2])
         off[:, CORNERS] = (residuals.corners_px - self.corners_px).swapaxes(1, 2).reshape(-1, 8)
         off[:, BLUR], off[:, LINEAR][:, SMALL] = residuals.blur - self.blur_px, residuals.amounts[:, SMALL]

@@ -73,8 +73,9 @@ class Segments(NamedTuple):
     def displaced_by_slopes(self) -> FloatArray:
         """Displacement (N,) of a side by a slope of its contrast across it as large as that along it, rms [px].
 
-        Over two segments a slope changes it twice as much as over one, noise and the cells behind the sides as much. A
-        few segments that other objects cover do not count.
+        A slope changes the contrast twice as much over two segments as over one. Noise and the cells behind the sides
+        change it as much over either, so that they cancel in the difference of the squares. Medians leave out the few
+        segments that other objects cover.
         """
         used = (self.variance < UNMEASURED).reshape(len(self.variance), 4, -1)
         contrast, sizes = self.contrast.reshape(used.shape), []

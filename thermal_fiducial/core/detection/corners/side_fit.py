@@ -28,7 +28,7 @@ from thermal_fiducial.core.detection.corners.sides import (
     sides_of,
 )
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
-from thermal_fiducial.core.detection.corners.warm_surface import ending_sides, freed_of_unevenness, nearer
+from thermal_fiducial.core.detection.corners.warm_surface import ending_sides, freed_of_unevenness, shortened_reach
 from thermal_fiducial.core.detection.prediction.frame import counts_of, MotionBlur
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import widths
@@ -129,7 +129,8 @@ def _to_repeat(
 ) -> tuple[IntArray, FloatArray]:
     """Places (M,) of those of N markers that are to be refined again, and the reach of all.
 
-    From farther off near pixels pull towards another edge, and another edge ends the surface.
+    Where corners are still far off, the reach stays: near pixels would pull them towards another edge, and another
+    edge would look like the end of the surface.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ def _to_repeat(
     if gradient_shows.any() or ending.any():
         is_near = np.isfinite(reach[:, 0]).any(axis=1)
         moving = moving | (gradient_shows & ~is_near) | ending.any(axis=1)
-        reach = nearer(reach, gradient_shows, ending, outward, width)
+        reach = shortened_reach(reach, gradient_shows, ending, outward, width)
     return moving.nonzero()[0], reach
 
 

@@ -132,10 +132,10 @@ def _quadratic(contrast: FloatArray, used: BoolArray, cells: int) -> FloatArray:
     return np.asarray(amounts @ around.drawn)
 
 
-def nearer(
+def shortened_reach(
     reach: FloatArray, uneven: BoolArray, ending: BoolArray, outward: FloatArray, width: FloatArray
 ) -> FloatArray:
-    """A ``reach`` with near pixels alone for ``uneven`` markers (N,), and less at ``ending`` sides (N, 4).
+    """The ``reach``, shorter for ``uneven`` markers (N,), and outside ``ending`` sides (N, 4).
 
     Parameters
     ----------
