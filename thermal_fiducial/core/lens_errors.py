@@ -86,7 +86,7 @@ class LensErrors:
     def _variables(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Draws of the smooth error (I, 2, K), of the focal length (K,), and of the aspect ratio (K,)."""
         seed = crc32(np.ascontiguousarray(self._camera.K).tobytes())
-        smooth, (focal_length, aspect) = _variables(seed, self.modes.shape[-1])
+        smooth, (focal_length, aspect) = _drawn_variables(seed, self.modes.shape[-1])
         return smooth, focal_length, aspect if self._aspect_left is None else self._aspect_left
 
 
@@ -117,7 +117,7 @@ def _nodes(size: int, length: float) -> tuple[FloatArray, FloatArray]:
 
 
 @lru_cache(maxsize=_CAMERAS)
-def _variables(seed: int, modes: int) -> tuple[FloatArray, FloatArray]:
+def _drawn_variables(seed: int, modes: int) -> tuple[FloatArray, FloatArray]:
     """Variables (modes, 2, DRAWS), (2, DRAWS) of a camera, of variance one; uncorrelated as far as there are draws."""
     count = 2 * modes + 2
     most, fewest = max(count, DRAWS), min(count, DRAWS)

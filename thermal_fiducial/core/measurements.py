@@ -267,16 +267,15 @@ class CameraPose:
         """The pose with a covariance that is larger ``by`` (6, 6)."""
         return replace(self, covariance=self.covariance + by)
 
-
-def in_moved_map(pose: CameraPose, T_new_old: FloatArray) -> CameraPose:
-    """``pose`` in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-    R = T_new_old[:3, :3]
-    return replace(
-        pose,
-        T_map_camera=T_new_old @ pose.T_map_camera,
-        covariance=turned(pose.covariance, R),
-        map_covariance=turned(pose.map_covariance, R),
-    )
+    def in_moved_map(self, T_new_old: FloatArray) -> 'CameraPose':
+        """The pose in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
+        R = T_new_old[:3, :3]
+        return replace(
+            self,
+            T_map_camera=T_new_old @ self.T_map_camera,
+            covariance=turned(self.covariance, R),
+            map_covariance=turned(self.map_covariance, R),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,6 +293,11 @@ class Odometry:
     pose_covariance: FloatArray
     #: (6, 6), linear then angular, in ``base_link`` [m/s, rad/s]
     twist_covariance: FloatArray
+
+    def in_moved_map(self, T_new_old: FloatArray) -> 'Odometry':
+        """The odometry in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
+        covariance = turned(self.pose_covariance, T_new_old[:3, :3])
+        return replace(self, T_map_body=T_new_old @ self.T_map_body, pose_covariance=covariance)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,12 +12,12 @@ from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.hypotheses import KNOWN_OFFSET_STD, passes_with_unknown_clock
 from thermal_fiducial.core.filter.imu_input import CLOCK_EVIDENCE, ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
-from thermal_fiducial.core.filter.output import condition_of, figures_of, in_corrected_map, leaning_map, odometry
+from thermal_fiducial.core.filter.output import condition_of, figures_of, leaning_map, odometry
 from thermal_fiducial.core.filter.propagation import usable_seconds
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
 from thermal_fiducial.core.geometry.plausibility import checked_covariance, require_pose
 from thermal_fiducial.core.geometry.se3 import inverse
-from thermal_fiducial.core.measurements import CameraPose, Condition, ImuSample, in_moved_map, Odometry
+from thermal_fiducial.core.measurements import CameraPose, Condition, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 
@@ -76,7 +76,7 @@ class PoseEkf:
         if history.main is None:
             return None
         published = odometry(history, history.main)
-        return published if self._T_map_first is None else in_corrected_map(published, self._T_map_first)
+        return published if self._T_map_first is None else published.in_moved_map(self._T_map_first)
 
     def keep_imu(self, sample: ImuSample) -> bool:
         """Buffer an IMU sample without propagating to it: the next :meth:`add_imu` propagates over all buffered ones.
@@ -114,7 +114,7 @@ class PoseEkf:
             return PoseUpdate(stamp_ns, False, f'refused: {fault}', np.nan)
         off_grid_ns = self._frame_grid.off_grid(stamp_ns) if self._config.estimate_time_offset else 0
         if self._T_map_first is not None:
-            pose = in_moved_map(pose, inverse(self._T_map_first))
+            pose = pose.in_moved_map(inverse(self._T_map_first))
         pose, step_error_ns = self._in_present_clock(pose)
         if reason := self._unusable(pose):
             return PoseUpdate(stamp_ns, False, reason, np.nan)
@@ -149,7 +149,8 @@ class PoseEkf:
         interval_ns = self._input.longest_short_ns
         step_ns = clock.proposed(pose, history.imu.newest_ns, interval_ns)
         if not clock.suspects_imu:
-            history.explain_jump()
+            # Poses show that samples were lost at the jump: the clock of the IMU has not stepped.
+            history.stepped = None
         if not step_ns:
             return pose, 0
         if abs(step_ns) < SMALLEST_STEP_NS:

@@ -142,10 +142,6 @@ class History:
             before = self.carried(self.main, newest_ns).estimate
             self.stepped = self.main._replace(estimate=replace(before, stamp_ns=before.stamp_ns + size_ns))
 
-    def explain_jump(self) -> None:
-        """Take a jump for time that passed: poses show that samples were lost, the clock of the IMU has not stepped."""
-        self.stepped = None
-
     def forget_poses(self) -> None:
         """Remove all poses and beliefs."""
         self._poses, self._beliefs, self.main, self.stepped = [], [Belief()], None, None

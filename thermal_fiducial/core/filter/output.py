@@ -29,7 +29,6 @@ from thermal_fiducial.core.geometry.se3 import (
     so3_exp,
     so3_log,
     transform,
-    turned,
     twist_transfer,
 )
 from thermal_fiducial.core.measurements import Condition, Odometry
@@ -124,12 +123,6 @@ def _difference(state: NavigationState, other: NavigationState) -> FloatArray:
     apart = pose_error(state, other.T_map_body)
     velocity = (other.velocity - state.velocity) @ state.R_map_body
     return np.concatenate((apart[:3], velocity, apart[3:]))
-
-
-def in_corrected_map(odometry: Odometry, T_new_old: FloatArray) -> Odometry:
-    """Odometry in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-    covariance = turned(odometry.pose_covariance, T_new_old[:3, :3])
-    return replace(odometry, T_map_body=T_new_old @ odometry.T_map_body, pose_covariance=covariance)
 
 
 def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:

@@ -94,11 +94,6 @@ def _unexplained(state: NavigationState, pose: BodyPose) -> FloatArray:
     return pose_error(state, inverse(state.T_map_markers) @ pose.T_map_body) - state.systematic
 
 
-def _by_map(state: NavigationState) -> FloatArray:
-    """(6, 6) derivative of a measured pose by the motion of its markers' map."""
-    return displacement_of_body(state.T_map_markers @ state.T_map_body)
-
-
 def mount_jacobian(state: NavigationState) -> FloatArray:
     """(6, 3) derivative of a measured pose by a rotation of the camera against the robot, about the camera [rad]."""
     return np.vstack((np.eye(3), skew(state.T_body_camera[:3, 3])))
@@ -130,13 +125,14 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
     else:
         R += config.time_offset_std**2 * jitter
     value = _unexplained(prior.state, pose)
-    H[:, MARKERS] = _by_map(prior.state)
+    H[:, MARKERS] = displacement_of_body(prior.state.T_map_markers @ prior.state.T_map_body)
     S = H @ prior.covariance @ H.T + R
     if prior.covariance[MARKERS, MARKERS].any():
         # New markers may be off by decimetres: a derivative from where they are thought to be would show turns of the
         # map that nothing shows.
         error = prior.covariance @ H.T @ np.linalg.solve(S, value)
-        H[:, MARKERS] = _by_map(prior.state.moved_in_map(error))
+        state = prior.state.moved_in_map(error)
+        H[:, MARKERS] = displacement_of_body(state.T_map_markers @ state.T_map_body)
         S = H @ prior.covariance @ H.T + R
     S_inverse = np.asarray(np.linalg.inv(S))
     of_extrinsics = prior.of_extrinsics

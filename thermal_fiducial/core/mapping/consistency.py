@@ -16,7 +16,6 @@ from thermal_fiducial.core.error_model import covariance_of_one_error, INCONSIST
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import difference, inverse, rotation_angle
 from thermal_fiducial.core.mapping.contradicted_map import ContradictedMap, MOST, most_px
-from thermal_fiducial.core.mapping.localization import names
 from thermal_fiducial.core.mapping.located import (
     error_std_px,
     LocatedFrame,
@@ -27,7 +26,7 @@ from thermal_fiducial.core.mapping.located import (
     squared_distance,
 )
 from thermal_fiducial.core.mapping.map_data import MapMarker, NEW_FRAME_SHARE
-from thermal_fiducial.core.measurements import CameraPose, in_moved_map
+from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.two_poses import DECISIVE
 from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
@@ -71,7 +70,7 @@ def from_consistent_markers(
     sight, reprojection = found.sight, found.reprojection
     if not np.any(reprojection.errors_px > DISAGREEMENT * error_std_px(sight, reprojection, np.zeros((6, 6)))):
         return found
-    contradiction = Refusal(f'{names(sight)} contradict each other')
+    contradiction = Refusal(f'{sight.names} contradict each other')
     if predicted is None:
         return contradiction
     apart = _distances(sight, camera, predicted.pose)
@@ -277,7 +276,7 @@ def _is_back(misplaced: MisplacedMarker, pose: CameraPose, predicted: PredictedC
     """Whether a marker is rather in its place in the map than where it was found, by odometry."""
     if predicted is None:
         return False
-    elsewhere = in_moved_map(pose, inverse(misplaced.T_moved))
+    elsewhere = pose.in_moved_map(inverse(misplaced.T_moved))
     return squared_distance(elsewhere, predicted.pose) - squared_distance(pose, predicted.pose) > DECISIVE
 
 

@@ -19,7 +19,6 @@ from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, VAGUE
 from thermal_fiducial.core.two_poses import DECISIVE, mean_of_two, unknown_turn
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
-from thermal_fiducial.core.wording import marker_names
 
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.
 _PROPOSERS = 4
@@ -75,11 +74,11 @@ def locate(
         # A marker that the camera could not show is not where the map has it. The others give the pose, if most are.
         if 2 * np.count_nonzero(shown) > len(shown):
             return locate(stamp_ns, sight.only(shown), camera, model, odometry, last)
-        return Refusal(f'no camera pose explains {names(sight)}', compared=(sight, reprojection))
+        return Refusal(f'no camera pose explains {sight.names}', compared=(sight, reprojection))
     # Steps 5 and 6: refined with the weights of their errors.
     found = frame.refined(T, reprojection, frame.weights(reprojection, by_map))
     if found is None:
-        return Refusal(f'the pose from {names(sight)} is not determined')
+        return Refusal(f'the pose from {sight.names} is not determined')
     other = frame.alternative(found, hypotheses)
     if odometry is not None:
         return found if other is None and found.rotation_std <= VAGUE else _by_odometry(frame, found, other, odometry)
@@ -142,7 +141,7 @@ def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPo
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
     likelier, less_likely = (found, second) if chi2[0] <= chi2[1] else (second, found)
     pose = _mean(likelier, less_likely)
-    why = f'planar ambiguity of {names(frame.sight)} unsettled'
+    why = f'planar ambiguity of {frame.sight.names} unsettled'
     return Refusal(why, both, pose=pose, compared=likelier.compared)
 
 
@@ -174,8 +173,3 @@ def _hypotheses(sight: Sight, prior: CameraPose | None) -> FloatArray:
     poses = (sight.T_map_marker[largest, None] @ inverse(sight.observed.branches[largest])).reshape(-1, 4, 4)
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     return np.asarray(poses if prior is None else np.concatenate([poses, prior.T_map_camera[None]]))
-
-
-def names(sight: Sight) -> str:
-    """The markers of a frame, in words."""
-    return marker_names(sight.observed.ids.tolist())

@@ -21,7 +21,7 @@ from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Observations, VAGUE
 from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked
-from thermal_fiducial.core.wording import listed
+from thermal_fiducial.core.wording import listed, marker_names
 
 #: Squared Mahalanobis distance (6 d.o.f.) beyond which markers and odometry contradict each other: ten sigma.
 CONTRADICTION = 100.0
@@ -70,6 +70,11 @@ class Sight(Stacked):
             np.array([marker.draws for marker in known]).reshape(-1, *NO_DRAWS.shape),
             np.array([marker.surveyed for marker in known], dtype=np.bool_),
         )
+
+    @property
+    def names(self) -> str:
+        """The markers, in words."""
+        return marker_names(self.observed.ids.tolist())
 
     def reprojected(self, camera: Camera, T_map_camera: FloatArray) -> 'Reprojected':
         """The map's markers projected into a camera at ``T_map_camera`` (4, 4)."""

@@ -8,7 +8,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 
 from thermal_fiducial.core.error_model import at_most_claimed
 from thermal_fiducial.core.geometry.se3 import inverse
-from thermal_fiducial.core.measurements import CameraPose, in_moved_map, MOST_LATE_NS
+from thermal_fiducial.core.measurements import CameraPose, MOST_LATE_NS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.counting import CountingNode
@@ -52,7 +52,7 @@ class LatePoses:
     def as_of_its_stamp(self, pose: CameraPose) -> CameraPose:
         """``pose``, given in the present map, in the map as of its stamp."""
         for T_new_old in reversed(self._corrections.since(pose.stamp_ns)):
-            pose = in_moved_map(pose, inverse(T_new_old))
+            pose = pose.in_moved_map(inverse(T_new_old))
         return pose
 
 
@@ -105,5 +105,5 @@ class MapCorrections:
             # It changes slowly: that of another pose is used where that of this one is missing.
             pose = replace(pose, map_covariance=at_most_claimed(error.covariance, pose.covariance))
         for T_new_old in self._corrections.since(pose.stamp_ns):
-            pose = in_moved_map(pose, T_new_old)
+            pose = pose.in_moved_map(T_new_old)
         return pose

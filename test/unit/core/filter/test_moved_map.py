@@ -10,7 +10,6 @@ from support.flights import config, Flight
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.geometry.se3 import difference, inverse, lever_arm, retract, so3_exp, transform
-from thermal_fiducial.core.measurements import in_moved_map
 
 CORRECTIONS = {
     'turned about the vertical': transform(so3_exp([0.0, 0.0, 0.7]), [1.0, -2.0, 0.3]),
@@ -35,7 +34,7 @@ def run(flight, T_new_old, jump_ns):
         if kind == 0:
             outputs.append(ekf.add_imu(item))
         else:
-            ekf.add_pose(in_moved_map(item, T_new_old) if jumped else item)
+            ekf.add_pose(item.in_moved_map(T_new_old) if jumped else item)
     return outputs
 
 
@@ -74,7 +73,7 @@ def test_a_map_that_moves_before_the_start_is_started_in():
         if kind == 0:
             ekf.add_imu(item)
             continue
-        ekf.add_pose(in_moved_map(item, inverse(T_new_old)) if poses == 0 else item)
+        ekf.add_pose(item.in_moved_map(inverse(T_new_old)) if poses == 0 else item)
         poses += 1
         if poses == 1:
             assert ekf.state is None
@@ -148,7 +147,7 @@ def test_without_a_correction_the_jump_is_refused_at_first():
         if kind == 0:
             ekf.add_imu(item)
         else:
-            update = ekf.add_pose(in_moved_map(item, T_new_old) if late else item)
+            update = ekf.add_pose(item.in_moved_map(T_new_old) if late else item)
             accepted.append((late, update.accepted))
     assert not next(was_accepted for late, was_accepted in accepted if late)
     assert [was_accepted for late, was_accepted in accepted if not late][-1]
