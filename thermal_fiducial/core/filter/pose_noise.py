@@ -188,10 +188,6 @@ class PoseNoise:
         known = float(self.information[0] / (_PRIOR + self.information[0]))
         return 1.0 - known * min(float(self.variances[0]), 1.0)
 
-    def covariance(self, units: FloatArray) -> FloatArray:
-        """Covariance (6, 6) of an innovation by white errors; ``units`` (3, 6, 6) are those by variances of 1."""
-        return np.asarray((self.variances[:, None, None] * units).sum(axis=0))
-
     def adapted(self, units: FloatArray, innovation: FloatArray, S: FloatArray) -> 'PoseNoise':
         """Adapt the variances to the change of the innovation since the last pose: one step of Fisher scoring.
 

@@ -118,7 +118,7 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
     mount = mount_jacobian(prior.state)
     jitter = np.outer(derivative[POSE], derivative[POSE])
     units = np.stack((pose.shape, jitter, mount @ mount.T))
-    R = prior.pose_noise.covariance(units)
+    R = np.asarray((prior.pose_noise.variances[:, None, None] * units).sum(axis=0))
     if config.estimate_time_offset:
         H[:, TIME_OFFSET] = derivative[POSE]
         R += _second_order_of_clock(prior, motion, derivative)

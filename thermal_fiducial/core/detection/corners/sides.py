@@ -131,7 +131,7 @@ def columns_across(
     normal = np.where(steep, normal[::-1], normal).transpose(1, 2, 0)
     half = min(max(math.ceil(_REACHES * blur_px + 1.0), _SHORTEST), _LONGEST)
     base, offsets = np.rint(centre), np.arange(-half, half + 1)[:, None, None, None]
-    fresh, inside = _seen(whole, base, steep, nodes, shape, half)
+    fresh, inside = _in_image(whole, base, steep, nodes, shape, half)
     off, rise = ((base - centre) * pitch).astype(np.float32), pitch.astype(np.float32)
     # For each part, not for each side: numpy is slow where it repeats the few numbers of a row.
     parts_steep = np.repeat(steep, cells, axis=1)
@@ -162,7 +162,7 @@ def _parts(cells: int, columns: int) -> tuple[FloatArray, FloatArray]:
     return share[:, None], weights.reshape(2 * columns, cells, len(NODES)).swapaxes(1, 2)
 
 
-def _seen(
+def _in_image(
     whole: FloatArray, base: FloatArray, steep: BoolArray, nodes: FloatArray, shape: tuple[int, ...], half: int
 ) -> tuple[BoolArray, BoolArray | None]:
     """Which columns (C, E, m) lie in the image, repeating no other, and which of their pixels (M, C, E, m) do."""

@@ -78,7 +78,7 @@ def drifted_markers(
     variances = (_OF_MATCH * cells) ** 2
     likely = [place for place, match in enumerate(alone) if match.gain > 0.0]
     for first in sorted(likely, key=lambda place: -alone[place].gain):
-        mean, left = _after(of_camera, flow[first], alone[first].shift_px, variances[first])
+        mean, left = _camera_given_match(of_camera, flow[first], alone[first].shift_px, variances[first])
         near = _SIGMAS * np.sqrt(_stds_px(flow, left) ** 2 + variances[:, None])
         matches = [template.best(*at) for template, *at in zip(templates, flow @ mean, near, strict=True)]
         matches[first] = alone[first]
@@ -96,7 +96,7 @@ def _stds_px(flow: FloatArray, of_camera: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(((flow @ of_camera) * flow).sum(axis=-1)))
 
 
-def _after(
+def _camera_given_match(
     of_camera: FloatArray, flow: FloatArray, shift_px: FloatArray, variance: float
 ) -> tuple[FloatArray, FloatArray]:
     """Mean (6,) and covariance (6, 6) of the camera's displacement after one marker with ``flow`` (2, 6) is matched."""
@@ -156,7 +156,7 @@ class MarkerTemplate:
             corners = halfway(corners)
         self._id, self._corners, self._decoder = np.array([marker_id]), corners, decoder
         self._square_px = (cell / self._pixel * decoder.cells) ** 2
-        template, weights, origin = _seen(decoder.patterns(self._id, np.array([0]))[0], corners)
+        template, weights, origin = _template_of(decoder.patterns(self._id, np.array([0]))[0], corners)
         size, reach = np.array(template.shape[::-1]), np.ceil(reach_px / self._pixel).astype(np.int64)
         low, high = np.maximum(origin - reach, 0), np.minimum(origin + size + reach, self._image.shape[::-1])
         self._first, self._similarity = low - origin, np.zeros((0, 0), dtype=np.float32)
@@ -194,7 +194,7 @@ class MarkerTemplate:
         return np.clip(offset, -0.5, 0.5)
 
 
-def _seen(pattern: FloatArray, corners: FloatArray) -> tuple[Float32Array, Float32Array, IntArray]:
+def _template_of(pattern: FloatArray, corners: FloatArray) -> tuple[Float32Array, Float32Array, IntArray]:
     """A ``pattern`` (m, m) as seen with its ``corners`` (4, 2), weights of the pixels, (h, w), and the origin [px]."""
     drawn = np.pad(pattern, _MARGIN, constant_values=1.0).repeat(_DRAWN_PX, axis=0).repeat(_DRAWN_PX, axis=1)
     compared, edge = np.zeros_like(drawn), round((_MARGIN - _COMPARED) * _DRAWN_PX)

@@ -78,10 +78,6 @@ class FrameHistory:
             balance = self.balance * math.exp(-elapsed_ns / (_REMEMBERED_S * SECOND_NS))
         return FrameHistory(track, balance, saw_partial, self.searched_ns, self.scales, gray_scale)
 
-    def searched_within(self, stamp_ns: int, seconds: float) -> bool:
-        """Whether the last blind search was less than ``seconds`` before a frame; not so if stamps went back."""
-        return self.searched_ns is not None and 0 <= stamp_ns - self.searched_ns < seconds * SECOND_NS
-
     def polarities(self, rule: str) -> tuple[float, ...]:
         """Possible ones by the parameter ``polarity``: 1 for markers darker than their background, -1 for brighter."""
         if rule == 'any' or (rule == 'alike' and abs(self.balance) < _SURE):
@@ -116,8 +112,10 @@ class MarkerFinder:
             complete = len(found.ids) >= predictions and (predictions > 0 or history.saw_partial)
             enough = complete or (predictions > 0 and len(found.ids) >= _ENOUGH * predictions)
             holds = unfollowed is not None and enough
-        period = config.blind_period if holds else min(config.blind_period, _UNSURE_S)
-        if (complete or holds) and history.searched_within(frame.stamp_ns, period):
+        period, last_ns = config.blind_period if holds else min(config.blind_period, _UNSURE_S), history.searched_ns
+        # Not so if stamps went back.
+        is_recent = last_ns is not None and 0 <= frame.stamp_ns - last_ns < period * SECOND_NS
+        if (complete or holds) and is_recent:
             return found, history
         scales = _next_scales(history, found, complete=complete)
         found = found.and_elsewhere(self._blind(frame, history, found, scales, known, unfollowed, config))
