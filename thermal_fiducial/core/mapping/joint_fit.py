@@ -55,12 +55,12 @@ class JointFit:
     stamp_ns: int
     sight: Sight
     camera: Camera
-    model: SystematicErrors
+    errors: SystematicErrors
     fit: CameraFit
 
     def weights(self, reprojection: Reprojected, by_map: FloatArray) -> FloatArray:
         """Weights (N,) of the markers ``by_map`` (N,) and by their errors."""
-        return np.asarray(by_map * marker_weights(reprojection.errors_px, self.sight.noise_px, self.model))
+        return np.asarray(by_map * marker_weights(reprojection.errors_px, self.sight.noise_px, self.errors))
 
     def refined(self, T_map_camera: FloatArray, reprojection: Reprojected, weights: FloatArray) -> Location | None:
         """Gauss-Newton steps from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
@@ -118,17 +118,17 @@ class JointFit:
         gains : (6, 8 N) derivative of the pose by the corners' coordinates [1/px]
         chi2 : of the residuals
         """
-        n, sight, model = len(weights), self.sight, self.model
+        n, sight, errors = len(weights), self.sight, self.errors
         by_corner = np.swapaxes(gains.reshape(6, 4 * n, 2), 0, 1)
         white = independent_sum(by_corner, sight.observed.covariances.reshape(-1, 2, 2))
         white *= noise_factor(chi2, 8 * n - 6)
-        lens = LensErrors(sight.observed.corners, self.camera, model)
+        lens = LensErrors(sight.observed.corners, self.camera, errors)
         arms = sight.points - sight.T_map_marker[:, None, :3, 3]
         grown = gains @ (reprojection.J_marker.reshape(n, 4, 2, 6)[..., :3] @ arms[..., None]).ravel()
         map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ reprojection.J_marker
         # Sides of the markers and distances in the map have the same scale error.
         of_scale = np.einsum('nij,nj->i', map_gains[:, :, :3], sight.scale_arms) - grown
-        of_sides = model.marker_size_std * of_scale
+        of_sides = errors.marker_size_std * of_scale
         of_map = covariance_of_one_error(of_sides)
         if np.any(sight.map_covariances):
             of_map += covariance_by_draws(drawn_sum(map_gains, sight.draws))
@@ -263,7 +263,7 @@ class SurveyedFit(JointFit):
         """As of any fit, but errors of the survey are expected, and have joint weights."""
         sight = self.sight
         of_survey = np.diagonal(self._of_survey(reprojection), axis1=1, axis2=2).mean(axis=1)
-        by_errors = marker_weights(reprojection.errors_px, np.sqrt(sight.noise_px**2 + of_survey), self.model)
+        by_errors = marker_weights(reprojection.errors_px, np.sqrt(sight.noise_px**2 + of_survey), self.errors)
         return np.asarray(np.where(sight.surveyed, 1.0, by_map) * by_errors)
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> Alternative | None:
@@ -274,7 +274,7 @@ class SurveyedFit(JointFit):
     def _weighted(self, reprojection: Reprojected, weights: FloatArray) -> tuple[FloatArray, float]:
         """As of any fit; a corner is an outlier by what the others of its marker leave of it."""
         residuals, of_corners = reprojection.residuals.reshape(-1, 8, 1), self.sight.observed.covariances
-        of_survey = survey_for_weights(self._of_survey(reprojection), self.sight.noise_px, self.model)
+        of_survey = survey_for_weights(self._of_survey(reprojection), self.sight.noise_px, self.errors)
         information = weights[:, None, None] * np.linalg.inv(of_survey + block_diagonal(of_corners))
         weighted = information @ residuals
         pulls, of_each = weighted.reshape(-1, 4, 2, 1), diagonal_blocks(information)
@@ -291,7 +291,7 @@ class SurveyedFit(JointFit):
         return np.asarray(J @ self.sight.map_covariances @ J.swapaxes(-1, -2))
 
 
-def marker_weights(errors_px: FloatArray, noise_px: FloatArray, model: SystematicErrors) -> FloatArray:
+def marker_weights(errors_px: FloatArray, noise_px: FloatArray, errors: SystematicErrors) -> FloatArray:
     """Step 5 of Algorithm 1: weights (N,) of markers by their re-projection errors, rms [px].
 
     That is the expected variance, of noise and bias of the corners, over the present one, at most 1. Both coordinates
@@ -301,5 +301,5 @@ def marker_weights(errors_px: FloatArray, noise_px: FloatArray, model: Systemati
     ----------
     noise_px : (N,) standard deviation of a coordinate of the corners, by noise and survey
     """
-    expected = 2.0 * (noise_px**2 + model.likely_corner_px**2)
+    expected = 2.0 * (noise_px**2 + errors.likely_corner_px**2)
     return np.asarray(np.minimum(1.0, expected / np.maximum(errors_px**2, TINY)))

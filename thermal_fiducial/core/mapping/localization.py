@@ -42,7 +42,7 @@ def locate(
     stamp_ns: int,
     sight: Sight,
     camera: Camera,
-    model: SystematicErrors,
+    errors: SystematicErrors,
     odometry: CameraPose | None = None,
     last: CameraPose | None = None,
 ) -> Location | Refusal:
@@ -64,7 +64,7 @@ def locate(
         return Refusal('no usable pose of any known marker')
     hypotheses = hypotheses[np.argsort(fit.costs(hypotheses), kind='stable')]
     kind = SurveyedFit if sight.surveyed.any() else JointFit
-    frame = kind(stamp_ns, sight, camera, model, fit)
+    frame = kind(stamp_ns, sight, camera, errors, fit)
     # Steps 3 and 4: the pose from all markers jointly, weighted by the map.
     by_map = frame.map_weights(hypotheses[0])
     T = fit.solve(hypotheses[:1], by_map)[0][0]
@@ -73,7 +73,7 @@ def locate(
     if not shown.all():
         # A marker that the camera could not show is not where the map has it. The others give the pose, if most are.
         if 2 * np.count_nonzero(shown) > len(shown):
-            return locate(stamp_ns, sight.only(shown), camera, model, odometry, last)
+            return locate(stamp_ns, sight.only(shown), camera, errors, odometry, last)
         return Refusal(f'no camera pose explains {sight.names}', compared=(sight, reprojection))
     # Steps 5 and 6: refined with the weights of their errors.
     found = frame.refined(T, reprojection, frame.weights(reprojection, by_map))

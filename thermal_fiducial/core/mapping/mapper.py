@@ -136,7 +136,7 @@ class MarkerMapper:
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.sizes):
             odometry, last = (None, last_at(stamp_ns, self._last)) if predicted is None else (predicted.pose, None)
-            fit = partial(locate, stamp_ns, camera=camera, model=errors, odometry=odometry, last=last)
+            fit = partial(locate, stamp_ns, camera=camera, errors=errors, odometry=odometry, last=last)
             outcome = from_consistent_markers(sight, camera, predicted, fit)
             if isinstance(outcome, Location):
                 outcome = self.readout.claimed(outcome, predicted)
