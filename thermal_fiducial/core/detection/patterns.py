@@ -115,36 +115,29 @@ class Decoder:
     """
 
     def __init__(self, bits: Gray, correctable: int = 1) -> None:
-        self.correctable = correctable
         grid = np.pad(bits.astype(np.float64), ((0, 0), (1, 1), (1, 1)))
-        self.count, self.cells = len(grid), grid.shape[-1]
+        #: numbers of markers, of cells along a side, and of wrong bits that still leave the nearest marker certain
+        self.count, self.cells, self.correctable = len(grid), grid.shape[-1], correctable
         self._inner = np.pad(np.ones(bits.shape[1:], dtype=bool), 1).ravel()
+        #: number of bits of a marker
+        self.bits = int(self._inner.sum())
+        #: (M,) which markers show a pose
+        self.posed = ~turned_alike(bits)
         # Pattern k after `turn` steps: as it looks in a quadrilateral whose first corner is the marker's corner `turn`.
         self._grids = np.stack([np.rot90(grid, turn, axes=(1, 2)) for turn in range(4)], axis=1)
-        flat = self._grids.reshape(-1, self.cells**2)
-        across = np.linspace(-1.0, 1.0, self.cells)
-        x, y = np.tile(across, self.cells), np.repeat(across, self.cells)
-        smooth = np.linalg.qr(np.stack([np.ones(x.size), x, y, x * x, x * y, y * y], axis=1))[0]
-        # A quadratic background across the marker is projected out of patterns and images.
-        self._detrend = np.eye(x.size) - smooth @ smooth.T
-        detrended = flat @ self._detrend
+        detrend = self._detrend = _detrending(self.cells)
+        detrended = self._grids.reshape(-1, self.cells**2) @ detrend
         patterns = detrended / np.maximum(np.linalg.norm(detrended, axis=1, keepdims=True), TINY)
+        self._patterns = patterns.astype(np.float32)
         likeness = np.abs(patterns[::4] @ patterns.T).reshape(self.count, -1, 4).max(axis=-1)
         np.fill_diagonal(likeness, 0.0)
         #: (M,) margin of correlation of a perfect view of each marker over any other
         self.isolation = 1.0 - likeness.max(axis=1)
-        #: (M,) which markers show a pose
-        self.posed = ~turned_alike(bits)
-        self._patterns = patterns.astype(np.float32)
-        #: number of bits of a marker
-        self.bits = int(self._inner.sum())
-        border = self._inner @ self._detrend
+        border = self._inner @ detrend
         self._border = border / np.linalg.norm(border)
-        share = ((np.arange(self.cells)[:, None] + CELL_SAMPLES) / self.cells).ravel()
-        self._samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share))).astype(np.float32)
         self._beside_sides = _beside_sides(self.cells)
-        mean = np.kron(np.eye(self.cells), np.full((len(CELL_SAMPLES), 1), 1.0 / len(CELL_SAMPLES)))
-        self._cells_of_samples = (np.kron(mean, mean) @ self._detrend).astype(np.float32)
+        self._samples, means = _cell_samples(self.cells)
+        self._cells_of_samples = (means @ detrend).astype(np.float32)
 
     def read(
         self,
@@ -245,6 +238,22 @@ class Decoder:
 def shrunk(quads: FloatArray, cells: int, margin: float) -> FloatArray:
     """Outlines (Q, 4, 2) of the markers in white plates (Q, 4, 2) with such a ``margin`` [cells]."""
     return seen_between(quads, _in_plate(cells, margin)).transpose(1, 2, 0)
+
+
+def _detrending(cells: int) -> FloatArray:
+    """(m * m, m * m) by which values of cells, row by row, are freed of a quadratic background across the marker."""
+    across = np.linspace(-1.0, 1.0, cells)
+    x, y = np.tile(across, cells), np.repeat(across, cells)
+    smooth = np.linalg.qr(np.stack([np.ones(x.size), x, y, x * x, x * y, y * y], axis=1))[0]
+    return np.asarray(np.eye(x.size) - smooth @ smooth.T)
+
+
+def _cell_samples(cells: int) -> tuple[Float32Array, FloatArray]:
+    """Of :func:`bilinear`, (4, P): samples of all cells; and (P, m * m) by which the means of the cells follow."""
+    share = ((np.arange(cells)[:, None] + CELL_SAMPLES) / cells).ravel()
+    samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share))).astype(np.float32)
+    mean = np.kron(np.eye(cells), np.full((len(CELL_SAMPLES), 1), 1.0 / len(CELL_SAMPLES)))
+    return samples, np.asarray(np.kron(mean, mean), dtype=np.float64)
 
 
 def _beside_sides(cells: int) -> Float32Array:

@@ -90,33 +90,47 @@ class BlindSearch:
         scales : resolutions of the search
         polarities : those searched at half resolution, 1 for markers darker than their surroundings, -1 for brighter
         """
-        # The plate, and as much again for its blurred edge.
-        hidden = grown(found.places.points.px, (self._decoder.cells + 4) / self._decoder.cells)
-        min_side_px, edge_px = config.min_side_px - _SHORTER_PX, _EDGE_PX
-        if frame.displayed:
-            min_side_px, edge_px = _PICTURE_SIDE * config.min_side_px, 0.0
-        fine = faint = np.zeros((0, 4, 2))
-        half, clear = frame.image, SearchScales.ALL not in scales
-        if SearchScales.FINE in scales:
-            fine = find_quads(self._fine_mask(frame, clear=clear), min_side_px, hidden, edge_px)
-        if SearchScales.FAINT in scales:
-            half = with_columns_corrected(halved(frame.image), 0.5 * frame.noise)
-            near = about_background(half, 0.5 * _RANGE * frame.noise) if SearchScales.CLIPPED in scales else half
-            masks = (
-                self._faint.mask(near if polarity > 0.0 else -near, 0.5 * frame.noise, clear=clear)
-                for polarity in polarities
-            )
-            outlines = [find_quads(mask, 0.5 * config.min_side_px + 2.0, halfway(hidden)) for mask in masks]
-            faint = 2.0 * np.concatenate(outlines) + 0.5
+        min_side_px = _PICTURE_SIDE * config.min_side_px if frame.displayed else config.min_side_px - _SHORTER_PX
+        half, fine, faint = self._outlines(frame, found, scales, polarities, min_side_px, config)
         # A search at full resolution alone is for clear markers, which need no alignment.
-        pull = SearchScales.FAINT in scales
-        reading, quads = self._read(frame, half, (fine, faint), allowed, found.ids if pull else None)
+        to_align = SearchScales.FAINT in scales
+        reading, quads = self._read(frame, half, (fine, faint), allowed, found.ids if to_align else None)
         good = accepted(reading, frame.noise, self._decoder.correctable, config)
         good &= (squared_sides(quads) >= min_side_px**2).all(axis=1)
         good &= (frame.camera.contains(quads, CUT_OFF_PX) & frame.camera.shows(quads)).all(axis=1)
         good &= ~overlapped(reading, quads, good, distinct(reading, frame.noise, config))
         chosen = _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), frame.noise)
         return chosen._replace(corners_px=large_aligned(frame.image, chosen.corners_px, chosen.ids, self._decoder))
+
+    def _outlines(
+        self,
+        frame: Frame,
+        found: FoundMarkers,
+        scales: SearchScales,
+        polarities: tuple[float, ...],
+        min_side_px: float,
+        config: ArucoDetectorConfig,
+    ) -> tuple[Float32Array, FloatArray, FloatArray]:
+        """The image at half resolution, and outlines (Q, 4, 2) found at full and at half, in pixels of the frame.
+
+        Without a search at half resolution the image is that of the frame.
+        """
+        # The plate, and as much again for its blurred edge.
+        hidden = grown(found.places.points.px, (self._decoder.cells + 4) / self._decoder.cells)
+        fine = faint = np.zeros((0, 4, 2))
+        half, clear = frame.image, SearchScales.ALL not in scales
+        if SearchScales.FINE in scales:
+            edge_px = 0.0 if frame.displayed else _EDGE_PX
+            fine = find_quads(self._fine_mask(frame, clear=clear), min_side_px, hidden, edge_px)
+        if SearchScales.FAINT in scales:
+            noise = 0.5 * frame.noise
+            half = with_columns_corrected(halved(frame.image), noise)
+            near = about_background(half, _RANGE * noise) if SearchScales.CLIPPED in scales else half
+            signed = (near if polarity > 0.0 else -near for polarity in polarities)
+            masks = (self._faint.mask(dark, noise, clear=clear) for dark in signed)
+            outlines = [find_quads(mask, 0.5 * config.min_side_px + 2.0, halfway(hidden)) for mask in masks]
+            faint = 2.0 * np.concatenate(outlines) + 0.5
+        return half, fine, faint
 
     def _fine_mask(self, frame: Frame, *, clear: bool) -> Gray:
         if frame.displayed:
