@@ -22,15 +22,7 @@ from thermal_fiducial.core.filter.state import (
     VELOCITY,
 )
 from thermal_fiducial.core.filter.update import pose_error
-from thermal_fiducial.core.geometry.se3 import (
-    inverse,
-    lever_arm,
-    skew,
-    so3_exp,
-    so3_log,
-    transform,
-    twist_transfer,
-)
+from thermal_fiducial.core.geometry.se3 import inverse, lever_arm, skew, so3_exp, so3_log, transform, twist_transfer
 from thermal_fiducial.core.measurements import Condition, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 

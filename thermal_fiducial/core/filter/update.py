@@ -10,12 +10,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.evidence import ClockEvidence
 from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
-from thermal_fiducial.core.filter.pose_noise import (
-    BodyPose,
-    displacement_of_body,
-    PoseNoise,
-    share_that_stays,
-)
+from thermal_fiducial.core.filter.pose_noise import BodyPose, displacement_of_body, PoseNoise, share_that_stays
 from thermal_fiducial.core.filter.state import (
     CORE,
     embedded_core,

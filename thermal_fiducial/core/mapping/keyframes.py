@@ -6,12 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import (
-    divided_prior,
-    draws_of,
-    information_of_followed_map,
-    SystematicErrors,
-)
+from thermal_fiducial.core.error_model import divided_prior, draws_of, information_of_followed_map, SystematicErrors
 from thermal_fiducial.core.geometry.camera import by_other_calibration, Camera
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot

@@ -6,12 +6,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import (
-    arms_of_scale,
-    drawn_sum,
-    INCONSISTENT_PX,
-    NO_DRAWS,
-)
+from thermal_fiducial.core.error_model import arms_of_scale, drawn_sum, INCONSISTENT_PX, NO_DRAWS
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise
 from thermal_fiducial.core.geometry.se3 import difference, lever_arm, screwed, turn_of_pose

@@ -6,13 +6,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import (
-    arms_of_scale,
-    assumed_draws,
-    NO_DRAWS,
-    scale_of_map,
-    SystematicErrors,
-)
+from thermal_fiducial.core.error_model import arms_of_scale, assumed_draws, NO_DRAWS, scale_of_map, SystematicErrors
 from thermal_fiducial.core.geometry.plausibility import require_numbers, require_pose, require_side
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.geometry.se3 import apply, quaternion_from_rotation, rigid_alignment

@@ -13,12 +13,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.corners.corner_errors import OF_SIDES_PX
-from thermal_fiducial.core.detection.corners.segments import (
-    measure,
-    REACHED,
-    robust_fit,
-    UNMEASURED,
-)
+from thermal_fiducial.core.detection.corners.segments import measure, REACHED, robust_fit, UNMEASURED
 from thermal_fiducial.core.detection.corners.sides import (
     Blur,
     blur_of,
