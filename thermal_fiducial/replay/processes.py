@@ -28,7 +28,7 @@ from thermal_fiducial.replay.latency import LatencyMeter
 from thermal_fiducial.replay.recorder import Recorder
 from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.base.counting import CountingNode
-from thermal_fiducial.ros.process.promptness import prompt
+from thermal_fiducial.ros.process.low_latency import prompt
 from thermal_fiducial.ros.process.run import initialise, make_executor, OF_A_COMMAND
 
 #: Time for the nodes to match among themselves after both ends of each topic are in the graph [s].

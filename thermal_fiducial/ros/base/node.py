@@ -20,8 +20,8 @@ from thermal_fiducial.files.reading import one_line
 from thermal_fiducial.ros.base import params
 from thermal_fiducial.ros.base.console import Console
 from thermal_fiducial.ros.base.counting import CountingNode
-from thermal_fiducial.ros.base.hearing import replaced_ports
 from thermal_fiducial.ros.base.input_rates import InputRates
+from thermal_fiducial.ros.base.replaced_ports import replaced_ports
 from thermal_fiducial.ros.messages import convert
 
 Made = TypeVar('Made')

@@ -19,10 +19,10 @@ from rclpy.utilities import ok, remove_ros_args, try_shutdown
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import params
 from thermal_fiducial.ros.base.node import StageNode
-from thermal_fiducial.ros.process.litter import remove_litter
-from thermal_fiducial.ros.process.promptness import keep_for_good, take_priority
+from thermal_fiducial.ros.process.low_latency import keep_for_good, take_priority
+from thermal_fiducial.ros.process.nonblocking_output import drop_what_does_not_fit, say_last
+from thermal_fiducial.ros.process.stale_shared_memory import remove_stale_memory
 from thermal_fiducial.ros.process.stopping import limit_the_end, release_the_end, StopSignals
-from thermal_fiducial.ros.process.unblocked import drop_what_does_not_fit, say_last
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 #: Environment variables of Fast DDS 2 (Jazzy) and Fast DDS 3.
@@ -164,7 +164,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
     with ExitStack() as ending:
         ending.callback(try_shutdown)
         try:
-            remove_litter()
+            remove_stale_memory()
             initialise(args, signals=SignalHandlerOptions.NO)
             _refuse_others(args)
             node = _made(make_node)

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from thermal_fiducial.ros.process import promptness
+from thermal_fiducial.ros.process import low_latency
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def test_all_threads_get_the_priority_and_lose_it_again(scheduler):
     other = threading.Thread(target=done.wait)
     other.start()
     threads = {threading.get_native_id(), other.native_id}
-    with promptness.prompt(1):
+    with low_latency.prompt(1):
         # Under SCHED_FIFO a thread that spins until another one has run would keep the core from it for good.
         assert {scheduler[thread] for thread in threads} == {os.SCHED_RR}
         assert gc.get_freeze_count() > 0
@@ -35,8 +35,8 @@ def test_all_threads_get_the_priority_and_lose_it_again(scheduler):
 
 def test_what_the_user_chose_stays(scheduler):
     scheduler[threading.get_native_id()] = os.SCHED_FIFO
-    assert promptness.take_priority(5)
-    with promptness.prompt(5):
+    assert low_latency.take_priority(5)
+    with low_latency.prompt(5):
         pass
     assert scheduler == {threading.get_native_id(): os.SCHED_FIFO}
 
@@ -46,4 +46,4 @@ def test_a_user_who_may_not_stays_ordinary(scheduler, monkeypatch):
         raise PermissionError
 
     monkeypatch.setattr(os, 'sched_setscheduler', refuse)
-    assert not promptness.take_priority(1)
+    assert not low_latency.take_priority(1)

@@ -14,7 +14,7 @@ _LOCK = re.compile(r'(fastrtps_[0-9a-f]{16})_el')
 _YOUNG_S = 10.0
 
 
-def remove_litter(folder: Path = _SHARED) -> None:
+def remove_stale_memory(folder: Path = _SHARED) -> None:
     """Remove segments of shared memory whose owner has ended, known by their lock, as ``fastdds shm clean`` does."""
     for file in folder.glob('fastrtps_*_el'):
         # Another user's, or removed by another node at this moment.

@@ -13,7 +13,7 @@ from support.empty_stage import environment, finished
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.ros.base import qos
-from thermal_fiducial.ros.base.hearing import replaced_ports
+from thermal_fiducial.ros.base.replaced_ports import replaced_ports
 
 pytestmark = pytest.mark.ros
 
@@ -87,7 +87,7 @@ from sensor_msgs.msg import Imu
 from support.empty_stage import EmptyStage
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.process.run import run
-from unit.ros.test_hearing import listening, SHARED
+from unit.ros.test_replaced_ports import listening, SHARED
 
 marker = Path(sys.argv.pop())
 

@@ -11,7 +11,7 @@ import time
 import pytest
 from support.empty_stage import environment, finished
 
-from thermal_fiducial.ros.process.litter import remove_litter
+from thermal_fiducial.ros.process.stale_shared_memory import remove_stale_memory
 
 DEAD, LIVING, YOUNG = 'fastrtps_0123456789abcdef', 'fastrtps_1123456789abcdef', 'fastrtps_2123456789abcdef'
 OTHERS = ('fastrtps_port7411', 'fastrtps_port7411_el', 'sem.fastrtps_3123456789abcdef', 'fastrtps_x_el')
@@ -28,7 +28,7 @@ def test_only_segments_that_nobody_holds_are_removed(tmp_path):
     before = set(tmp_path.iterdir())
     with (tmp_path / f'{LIVING}_el').open() as lock:
         fcntl.flock(lock, fcntl.LOCK_SH)
-        remove_litter(tmp_path)
+        remove_stale_memory(tmp_path)
     assert {path.name for path in before - set(tmp_path.iterdir())} == {DEAD, f'{DEAD}_el'}
 
 
