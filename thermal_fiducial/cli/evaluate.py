@@ -13,8 +13,8 @@ from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.page import evaluate_run, require_packages, VIDEO, write_page
 from thermal_fiducial.report.run_folder import Run
-from thermal_fiducial.report.table import Table
 from thermal_fiducial.report.tables import tables
+from thermal_fiducial.report.text_table import Table
 
 COMPARISON = Path('comparison.html')
 #: First columns up to this width do not wrap.

@@ -14,7 +14,7 @@ from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import STORAGES
 from thermal_fiducial.files.dictionary import load_dictionary
-from thermal_fiducial.files.flight_bags import frame_count, write_recording
+from thermal_fiducial.files.recording_to_bag import frame_count, write_recording
 from thermal_fiducial.files.recordings import read_recording
 from thermal_fiducial.files.work_folders import made_whole
 

@@ -8,8 +8,8 @@ from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.report.map_error import map_accuracy, marker_errors
-from thermal_fiducial.report.table import number, Table
 from thermal_fiducial.report.tables import map_error_table
+from thermal_fiducial.report.text_table import number, Table
 
 
 def add_error(parser: Parser) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import ImuSample
 from thermal_fiducial.core.types import SECOND_NS
-from thermal_fiducial.files.flight_bags import write_recording
+from thermal_fiducial.files.recording_to_bag import write_recording
 from thermal_fiducial.files.recordings import Corners, Recording
 from thermal_fiducial.files.rig_files import Rig
 from thermal_fiducial.files.work_folders import made_whole

@@ -6,7 +6,7 @@ from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.interruptions import GAP_NS
 from thermal_fiducial.report.metrics import CHI2_BAND_6
-from thermal_fiducial.report.time_plots import BAND, Chart, FIDUCIAL, FUSED, GOOD, TimePlots, TRUTH
+from thermal_fiducial.report.stacked_plots import BAND, Chart, FIDUCIAL, FUSED, GOOD, TimePlots, TRUTH
 
 LATENCY_COLOURS = {'imu_to_pose': FUSED, 'image_to_camera_pose': FIDUCIAL, 'image_to_corrected_pose': '#a855f7'}
 #: Lower limits of the logarithmic axes, to which smaller values are clipped.

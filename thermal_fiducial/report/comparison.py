@@ -23,7 +23,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.page import evaluate_run
-from thermal_fiducial.report.table import number, Table
+from thermal_fiducial.report.text_table import number, Table
 from thermal_fiducial.report.trajectory import Trajectory
 
 #: evo's own default [s].
@@ -184,7 +184,7 @@ def _at(numbers: dict[str, Any], keys: Sequence[str]) -> Any:
 
 
 def _charts(comparison: Comparison) -> list[Any]:
-    from thermal_fiducial.report.time_plots import Chart, TimePlots
+    from thermal_fiducial.report.stacked_plots import Chart, TimePlots
 
     plots = TimePlots(('position [mm]', 'attitude [deg]'))
     shown = False

@@ -12,8 +12,8 @@ from thermal_fiducial.report import metrics
 from thermal_fiducial.report.availability import at_frames, Available, available
 from thermal_fiducial.report.interruptions import imu_silence_ns, Interruption, interruptions, run_span
 from thermal_fiducial.report.map_error import map_accuracy
+from thermal_fiducial.report.marker_table import Tag, tags
 from thermal_fiducial.report.run_folder import Run
-from thermal_fiducial.report.tags import Tag, tags
 
 #: Sampling interval of the NEES [ns]: errors are correlated over time, so denser samples add no evidence.
 CONSISTENCY_NS = 100_000_000

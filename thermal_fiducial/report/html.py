@@ -13,9 +13,9 @@ from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.frames import FramePicture
 from thermal_fiducial.report.overview import Card, cards, facts
 from thermal_fiducial.report.space import scene_chart
-from thermal_fiducial.report.table import Table
+from thermal_fiducial.report.stacked_plots import Chart
 from thermal_fiducial.report.tables import tables
-from thermal_fiducial.report.time_plots import Chart
+from thermal_fiducial.report.text_table import Table
 from thermal_fiducial.report.verdict import judge, RunVerdict
 
 _HERE = Path(__file__).parent

@@ -2,7 +2,7 @@
 
 from thermal_fiducial.files.innovations import INNOVATIONS
 from thermal_fiducial.report.evaluation import Evaluation
-from thermal_fiducial.report.table import number, Table
+from thermal_fiducial.report.text_table import number, Table
 
 #: Units of the filter's figures, all SI; the others have none, or one in their name.
 _UNITS = {

@@ -5,7 +5,7 @@ from typing import Any
 
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.evaluation import Evaluation
-from thermal_fiducial.report.table import number
+from thermal_fiducial.report.text_table import number
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.evaluation import Evaluation
-from thermal_fiducial.report.time_plots import Chart, FIDUCIAL, FUSED, GOOD, MOST_DOTS, thinned, TRUTH
+from thermal_fiducial.report.stacked_plots import Chart, FIDUCIAL, FUSED, GOOD, MOST_DOTS, thinned, TRUTH
 from thermal_fiducial.report.trajectory import Trajectory
 
 #: Most points of the path.

@@ -4,7 +4,7 @@ from typing import Any
 
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.node_tables import figures_tables, load_table, said_table
-from thermal_fiducial.report.table import number, Table
+from thermal_fiducial.report.text_table import number, Table
 
 _BOTH = (
     ('position error, rms', 'mm', 'error', 'position_rms_mm'),

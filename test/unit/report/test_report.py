@@ -20,15 +20,15 @@ from thermal_fiducial.report.metrics import errors, other_unit
 from thermal_fiducial.report.overview import cards
 from thermal_fiducial.report.page import evaluate_run, write_page
 from thermal_fiducial.report.run_folder import read_run
-from thermal_fiducial.report.table import number
 from thermal_fiducial.report.tables import tables
+from thermal_fiducial.report.text_table import number
 from thermal_fiducial.report.trajectory import Trajectory
 from thermal_fiducial.report.verdict import judge, Weight
 
 pytest.importorskip('plotly')
 
 from thermal_fiducial.report.charts import euler_deg, near, visible_spans
-from thermal_fiducial.report.time_plots import thinned
+from thermal_fiducial.report.stacked_plots import thinned
 
 
 @pytest.fixture(scope='module')

@@ -15,7 +15,7 @@ pytest.importorskip('plotly')
 import plotly.graph_objects as go
 
 from thermal_fiducial.report.page import evaluate_run, write_page
-from thermal_fiducial.report.time_plots import FIDUCIAL, FUSED
+from thermal_fiducial.report.stacked_plots import FIDUCIAL, FUSED
 
 CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser') or shutil.which('google-chrome')
 CHARTS = [

@@ -28,12 +28,12 @@ from thermal_fiducial.report.availability import at_frames, available
 from thermal_fiducial.report.charts import clock_chart, error_charts
 from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.map_error import map_accuracy, marker_errors
+from thermal_fiducial.report.marker_table import tags
 from thermal_fiducial.report.output_bag import Arrivals, RecordedOutput
 from thermal_fiducial.report.picture import draw_error
 from thermal_fiducial.report.run_folder import read_run
-from thermal_fiducial.report.table import Table
-from thermal_fiducial.report.tags import tags
-from thermal_fiducial.report.time_plots import TimePlots
+from thermal_fiducial.report.stacked_plots import TimePlots
+from thermal_fiducial.report.text_table import Table
 from thermal_fiducial.report.trajectory import Trajectory
 from thermal_fiducial.report.verdict import HEADLINES, judge, Weight
 
