@@ -7,6 +7,7 @@ about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that t
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from operator import index
 from typing import Any, TYPE_CHECKING
 
@@ -69,9 +70,10 @@ _COVARIANCES = [_COLUMN[f'c{corner}{term}'] for corner in range(4) for term in (
 _COVARIANCE_TERMS = [_COLUMN[name] for name in CORNER_COVARIANCE_FIELDS]
 _DETECTOR_PX = [_COLUMN['detector_px']]
 _BRANCHES = [_COLUMN[f'{prefix}{name}'] for prefix in ('', 'a') for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')]
-#: Columns of observations, and where in a table of these alone all but the last of the four parts end.
+#: Columns of observations, and the places of corners, covariances, detector's error and poses among these.
 _OBSERVED = _CORNERS + _COVARIANCES + _DETECTOR_PX + _BRANCHES
-_ENDS = np.cumsum([len(part) for part in (_CORNERS, _COVARIANCES, _DETECTOR_PX)])
+_ENDS = np.cumsum([len(part) for part in (_CORNERS, _COVARIANCES, _DETECTOR_PX, _BRANCHES)]).tolist()
+_PARTS = [slice(begin, end) for begin, end in pairwise([0, *_ENDS])]
 
 
 def columns(markers: Markers, names: tuple[str, ...]) -> FloatArray:
@@ -174,7 +176,8 @@ class Observations(Stacked):
         """
         if getattr(markers, 'dtype', None) != MARKER_DTYPE:
             raise InputError('markers that are no rows of MARKER_DTYPE, as MarkerDetector.detect returns them')
-        corners, covariances, detector_px, poses = np.split(_numbers(markers, _OBSERVED), _ENDS, axis=1)
+        numbers = _numbers(markers, _OBSERVED)
+        corners, covariances, detector_px, poses = (numbers[:, part] for part in _PARTS)
         corners, covariances = corners.reshape(-1, 4, 2), covariances.reshape(-1, 4, 2, 2)
         poses = poses.reshape(-1, 2, 7)
         with np.errstate(invalid='ignore', divide='ignore'):
@@ -186,8 +189,9 @@ class Observations(Stacked):
         uu, uv, vv = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
         sound = (uu > 0.0) & (uu * vv > uv**2) & np.isfinite(corners).all(axis=2)
         usable: BoolArray = np.asarray(sound.all(axis=1))
-        if len(np.unique(ids)) < count:
-            usable &= (ids[:, None] == ids).sum(axis=1) == 1
+        if len(set(ids.tolist())) < count:
+            _, place, times = np.unique(ids, return_inverse=True, return_counts=True)
+            usable &= times[place] == 1
         return observations if usable.all() else observations.only(usable)
 
 
