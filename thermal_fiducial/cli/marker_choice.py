@@ -6,10 +6,14 @@ import numpy as np
 
 from thermal_fiducial.cli.arguments import warn
 from thermal_fiducial.cli.parser import Parser
-from thermal_fiducial.core.detection.patterns import turned_alike
-from thermal_fiducial.core.types import Gray
+from thermal_fiducial.core.detection.patterns import Dictionary, turned_alike
+from thermal_fiducial.core.wording import listed
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.fabrication.dictionary_search import mirror_images
 from thermal_fiducial.files.dictionary import load_dictionary
+
+# No dictionary of the package has more.
+_MOST_NAMED = 12
 
 
 def add_choice(parser: Parser) -> None:
@@ -20,19 +24,28 @@ def add_choice(parser: Parser) -> None:
     parser.add_argument('--ids', metavar='LIST', help='markers, e.g. 0-7,12 (default: all)')
 
 
-def chosen(args: argparse.Namespace) -> tuple[Gray, list[int]]:
-    """Bits (M, n, n) of the whole dictionary, and the chosen IDs.
+def chosen(args: argparse.Namespace) -> tuple[Dictionary, list[int]]:
+    """The whole dictionary, and the chosen IDs.
 
     Raises
     ------
     InputError
         No such dictionary, or no such marker in it.
     """
-    bits = load_dictionary(args.dictionary).bits
-    ids = list(range(len(bits))) if args.ids is None else _id_list(args.ids, len(bits), args.dictionary)
-    for index in np.flatnonzero(turned_alike(bits[ids])):
+    dictionary = load_dictionary(args.dictionary)
+    count = len(dictionary.bits)
+    ids = list(range(count)) if args.ids is None else _id_list(args.ids, count, args.dictionary)
+    for index in np.flatnonzero(turned_alike(dictionary.bits[ids])):
         warn(f'marker {ids[index]} of {args.dictionary} looks the same upside down, shows no pose and is not detected')
-    return bits, ids
+    return dictionary, ids
+
+
+def name_mirror_images(dictionary: Dictionary, ids: list[int]) -> None:
+    """Warn of the markers ``ids`` that in a mirror may be read as themselves or one another."""
+    pairs = mirror_images(dictionary.bits[ids], dictionary.correctable)
+    if pairs:
+        read = (f'{ids[a]} as {"itself" if a == b else ids[b]}' for a, b in pairs)
+        warn(f'in a mirror (metal, glass, a wet floor) these markers may be read: {listed(read, _MOST_NAMED)}')
 
 
 def _id_list(text: str, count: int, dictionary: str) -> list[int]:

@@ -9,10 +9,11 @@ from shlex import quote
 import numpy as np
 
 from thermal_fiducial.cli.arguments import add_force, refuse_to_overwrite, warn
-from thermal_fiducial.cli.marker_choice import add_choice, chosen
+from thermal_fiducial.cli.marker_choice import add_choice, chosen, name_mirror_images
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import BOARD_POINTS, CELLS, LENGTH_MM
+from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
@@ -54,9 +55,11 @@ def add_make(parser: Parser) -> None:
 
 
 def _make(args: argparse.Namespace) -> int:
-    drawings = list(_markers(args))
+    dictionary, ids = chosen(args)
+    drawings = _markers(dictionary, ids, args)
     _write_all(drawings, args)
-    _say_what_is_weak(drawings, args)
+    _say_what_is_weak(drawings, args, _cells(dictionary))
+    name_mirror_images(dictionary, ids)
     _say_parameters(args)
     return 0
 
@@ -76,9 +79,11 @@ def add_sheet(parser: Parser) -> None:
 
 def _sheet(args: argparse.Namespace) -> int:
     width, height = args.sheet
-    drawings = list(_markers(args))
+    dictionary, ids = chosen(args)
+    drawings = _markers(dictionary, ids, args)
     _write_all(nest(drawings, width, height, spacing=args.spacing, margin=args.margin), args)
-    _say_what_is_weak(drawings, args)
+    _say_what_is_weak(drawings, args, _cells(dictionary))
+    name_mirror_images(dictionary, ids)
     _say_parameters(args)
     return 0
 
@@ -118,18 +123,19 @@ def _board(args: argparse.Namespace) -> int:
         _write_all([circle_board(columns, rows, spacing, args.diameter, options)], args)
         _say_how_to_use(f'circles --grid {columns} {rows} --spacing {spacing:g} --diameter {args.diameter:g}')
         return 0
-    bits = load_dictionary(args.dictionary).bits
-    if not LEAST_MARKERS <= columns * rows <= len(bits):
-        possible = f'calibration needs {LEAST_MARKERS} or more, {args.dictionary} has {len(bits)}'
+    dictionary = load_dictionary(args.dictionary)
+    count = len(dictionary.bits)
+    if not LEAST_MARKERS <= columns * rows <= count:
+        possible = f'calibration needs {LEAST_MARKERS} or more, {args.dictionary} has {count}'
         raise InputError(f'a board of {columns} x {rows} markers: {possible}')
     labels = [str(index) for index in range(columns * rows)]
     centres = marker_grid(columns, rows, options.size, 40.0 if args.spacing is None else args.spacing)
-    base = base_plate(centres, labels, bits.shape[1] + 2, options)
+    base = base_plate(centres, labels, _cells(dictionary), options)
     board = args.out / 'board.yaml'
-    markers = [marker_drawing(bits[int(label)], label, options) for label in labels]
+    markers = _markers(dictionary, range(columns * rows), args)
     copy = copied_beside(args.dictionary, args.out)
     _write_all([*markers, base], args, [board, *filter(None, [copy])])
-    _say_what_is_weak(markers, args, bits.shape[1] + 2)
+    _say_what_is_weak(markers, args, _cells(dictionary))
     if copy is not None:
         write_text(copy, read_text(args.dictionary))
     save_map(board, _board_map(centres, options, Path(args.dictionary).name))
@@ -197,14 +203,18 @@ def _add_output(parser: Parser) -> None:
     parser.refuse(['--paper'], 'without pdf among --formats', lambda args: 'pdf' not in args.formats.split(','))
 
 
-def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cells: int | None = None) -> None:
-    """Print the narrowest web of each marker, and warnings about its strength and its warm ring."""
+def _cells(dictionary: Dictionary) -> int:
+    """Cells along a side of its markers, border included."""
+    return int(dictionary.bits.shape[1]) + 2
+
+
+def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cells: int) -> None:
+    """Print the narrowest web of each marker of ``cells`` a side, and warnings about its strength and its warm ring."""
     options = plate_options(args)
     if options.quiet_cells < 1.0:
         # doc/accuracy.md: the detector takes the warm surface for one that ends a cell outside the marker.
         ring = f'a warm ring of {options.quiet_cells:g} cells is too narrow'
         warn(f'{ring}: markers are measured too small, by 1 % at 0.7; 1 or more')
-    cells = cells or chosen(args)[0].shape[1] + 2
     with progress_bar('measuring webs') as progress:
         for done, drawing in enumerate(drawings, 1):
             strength = strength_of(drawing, options, cells, args.min_web)
@@ -214,11 +224,10 @@ def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cel
             progress(done / len(drawings))
 
 
-def _markers(args: argparse.Namespace) -> Iterable[Drawing]:
-    bits, ids = chosen(args)
+def _markers(dictionary: Dictionary, ids: Sequence[int], args: argparse.Namespace) -> list[Drawing]:
+    """Drawings of the markers ``ids``."""
     options = plate_options(args)
-    for marker_id in ids:
-        yield marker_drawing(bits[marker_id], str(marker_id), options)
+    return [marker_drawing(dictionary.bits[marker_id], str(marker_id), options) for marker_id in ids]
 
 
 def _write_all(drawings: Sequence[Drawing], args: argparse.Namespace, others: Sequence[Path] = ()) -> None:

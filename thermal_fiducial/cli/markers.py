@@ -6,7 +6,7 @@ from shlex import quote
 
 from thermal_fiducial.cli import marker_drawings, marker_planning
 from thermal_fiducial.cli.arguments import add_force, file_to_write, refuse_to_overwrite, whole_number
-from thermal_fiducial.cli.marker_choice import add_choice, chosen
+from thermal_fiducial.cli.marker_choice import add_choice, chosen, name_mirror_images
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import BITS, HAMMING, LENGTH_MM
@@ -50,7 +50,8 @@ def _add_check(parser: Parser) -> None:
 
 
 def _check(args: argparse.Namespace) -> int:
-    bits, ids = chosen(args)
+    dictionary, ids = chosen(args)
+    bits = dictionary.bits
     options = marker_drawings.plate_options(args)
     cells = bits.shape[1] + 2
     table = table_of(
@@ -82,6 +83,7 @@ def _check(args: argparse.Namespace) -> int:
             f'these are nearer to a negative than markers to one another ({number_of(least, "bit")}): where warm '
             f'plates in front of a cold surface may appear too, set polarity, or use {signed}, which have none'
         )
+    name_mirror_images(dictionary, ids)
     apart = f'distance between markers {between}, ' if len(ids) > 1 else 'distance '
     print(f'{good} of {number_of(len(ids), "marker")} can be cut; {apart}to own rotations {own}')
     return 0
@@ -97,7 +99,8 @@ def _add_bridge(parser: Parser) -> None:
 def _bridge(args: argparse.Namespace) -> int:
     # The lengths that can be drawn.
     options = PlateOptions(size=args.size, bridge_width=args.bridge_width)
-    bits, ids = chosen(args)
+    dictionary, ids = chosen(args)
+    bits = dictionary.bits
     cell = options.size / (bits.shape[1] + 2)
     table = table_of('', ('ID', 'patches', 'webs', 'longest web cells', 'read part of a white cell covered'))
     for marker_id in ids:

@@ -229,3 +229,16 @@ def negatives(bits: Gray, closer_than: int) -> list[tuple[int, int, int]]:
     differing = np.min([_differing(bits, np.rot90(1 - bits, turns, axes=(1, 2))) for turns in range(4)], axis=0)
     pairs = np.argwhere(np.triu(differing < closer_than))
     return [(int(a), int(b), int(differing[a, b])) for a, b in pairs]
+
+
+def mirror_images(bits: Gray, correctable: int) -> list[tuple[int, int]]:
+    """Pairs of markers that read as each other in a mirror, or of a marker with itself.
+
+    Parameters
+    ----------
+    bits : (M, n, n)
+    correctable : wrong bits that still name a marker
+    """
+    mirrored = bits[:, :, ::-1]
+    differing = np.min([_differing(mirrored, np.rot90(bits, turns, axes=(1, 2))) for turns in range(4)], axis=0)
+    return [(int(a), int(b)) for a, b in np.argwhere(np.triu(differing <= correctable))]

@@ -15,6 +15,7 @@ from thermal_fiducial.fabrication.cuttability import examine
 from thermal_fiducial.fabrication.dictionary_search import (
     apart_from_negatives,
     distances,
+    mirror_images,
     negatives,
     random_code,
     search,
@@ -115,10 +116,49 @@ def test_negatives_that_bits_distinguish_are_not_said_to_be_alike(capsys):
     assert 'only the border' not in printed
 
 
+def test_markers_that_a_mirror_turns_into_themselves_or_one_another():
+    """One by one, without correlations: a marker, reversed and turned, against each other one."""
+    dictionary = load_dictionary('STENCIL_4X4_80_SIGNED')
+    bits, expected = dictionary.bits, []
+    for a, marker in enumerate(bits):
+        turns = [np.rot90(np.fliplr(marker), turn) for turn in range(4)]
+        for b, other in enumerate(bits[a:], a):
+            if min(np.count_nonzero(turn != other) for turn in turns) <= dictionary.correctable:
+                expected.append((a, b))
+    assert {a == b for a, b in expected} == {True, False}
+    assert mirror_images(bits, dictionary.correctable) == expected
+
+
+@pytest.mark.parametrize('name', ['STENCIL_4X4_100', 'DICT_4X4_50'])
+def test_the_documents_name_the_markers_that_may_be_read_in_a_mirror(name):
+    dictionary = load_dictionary(name)
+    page = (Path(__file__).resolve().parents[3] / 'doc' / 'markers.md').read_text(encoding='utf-8')
+    (section,) = re.findall(
+        r'^### Markers that are like their image in a mirror$(.*?)^```', page, re.MULTILINE | re.DOTALL
+    )
+    (sentences,) = re.findall(rf'In `{name}`([^.]*)\.', section)
+    own, _, two = sentences.partition(';')
+    listed = [(int(a), int(a)) for a in re.findall(r'\d+', own)]
+    listed += [(int(a), int(b)) for a, b in re.findall(r'(\d+) and (\d+)', two)]
+    assert sorted(listed) == mirror_images(dictionary.bits, dictionary.correctable)
+
+
+def test_chosen_markers_that_may_be_read_in_a_mirror_are_named(capsys, tmp_path):
+    arguments = ['--mount', 'none', '--formats', 'svg', '--out', str(tmp_path), '--ids', '6,49,57,74']
+    assert main(['markers', 'make', *arguments]) == 0
+    assert capsys.readouterr().err == (
+        'warning: in a mirror (metal, glass, a wet floor) these markers may be read: 6 as itself, 49 as 57\n'
+    )
+    # Those of the documents' examples.
+    assert main(['markers', 'check', '--mount', 'none', '--ids', '20-27']) == 0
+    assert capsys.readouterr().err == ''
+
+
 def test_check_names_a_marker_that_looks_the_same_upside_down(capsys):
     assert main(['markers', 'check', '--dictionary', 'DICT_ARUCO_ORIGINAL', '--ids', '1022,1023']) == 0
     assert capsys.readouterr().err == (
         'warning: marker 1023 of DICT_ARUCO_ORIGINAL looks the same upside down, shows no pose and is not detected\n'
+        'warning: in a mirror (metal, glass, a wet floor) these markers may be read: 1023 as itself\n'
     )
 
 

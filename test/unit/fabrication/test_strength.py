@@ -85,14 +85,14 @@ def test_what_speaks_against_a_plate(options, said, tmp_path, capsys):
 
 
 def test_the_plate_of_the_defaults_is_fine(tmp_path, capsys):
-    assert main(['markers', 'make', '--ids', '5', '--formats', 'svg', '--out', str(tmp_path)]) == 0
+    assert main(['markers', 'make', '--ids', '3', '--formats', 'svg', '--out', str(tmp_path)]) == 0
     output = capsys.readouterr()
     assert output.err == ''
-    assert 'marker 5: narrowest web 3.0 mm (hole wall)' in output.out
+    assert 'marker 3: narrowest web 3.0 mm (hole wall)' in output.out
 
 
 def test_a_warm_ring_that_is_too_narrow_is_named(tmp_path, capsys):
-    command = ['markers', 'make', '--ids', '5', '--formats', 'svg', '--force', '--out', str(tmp_path), '--quiet-cells']
+    command = ['markers', 'make', '--ids', '3', '--formats', 'svg', '--force', '--out', str(tmp_path), '--quiet-cells']
     assert main([*command, '0.7']) == 0
     assert 'warning: a warm ring of 0.7 cells is too narrow' in capsys.readouterr().err
     assert main([*command, '1']) == 0
