@@ -541,7 +541,12 @@ class ArucoDetectorConfig(ImageRateParameters, ClockParameters, FrameParameters,
         maximum=0.05,
     )
     blur_px: float = param(
-        0.66, 'Standard deviation of the blur of optics and pixels.', unit='px', minimum=0.3, maximum=3.0
+        0.66,
+        'Standard deviation of the blur of optics and pixels, to a third. On raw counts it is estimated in flight, '
+        'from half to twice of it.',
+        unit='px',
+        minimum=0.3,
+        maximum=3.0,
     )
     plate_thickness: float = param(
         0.0,

@@ -79,9 +79,10 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
             self.detector.set_map(*clouds.map_poses(message))
 
     def state(self) -> tuple[bytes, str]:
-        """Number of markers in the last frame, markers of another dictionary, images skipped since the last call."""
+        """Number of markers in the last frame; another dictionary, blur, images skipped since the last call."""
         left = self._images.left_since()
-        doubts = [self._dictionaries.doubt, f'{left} older images skipped' if left else '']
+        blurred = '' if self.detector is None else self.detector.focus.doubt
+        doubts = [self._dictionaries.doubt, blurred, f'{left} older images skipped' if left else '']
         return WARN if any(doubts) else OK, '; '.join(filter(None, [number_of(self._seen, 'marker'), *doubts]))
 
     def headline(self) -> str:

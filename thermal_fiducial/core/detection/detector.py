@@ -8,6 +8,7 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.detection.confirmation import confirmed
+from thermal_fiducial.core.detection.corners.focus import Focus, shown_blur
 from thermal_fiducial.core.detection.corners.gray_scale import GrayScale
 from thermal_fiducial.core.detection.corners.refining import refine, RefinedMarkers
 from thermal_fiducial.core.detection.finding.finder import FrameHistory, MarkerFinder
@@ -63,13 +64,19 @@ class MarkerDetector:
             self._mount(config)
 
     def _mount(self, config: ArucoDetectorConfig) -> None:
-        self._history = FrameHistory(MotionTrack(se3.camera_in_body(config), config.bolometer_lag))
+        track = MotionTrack(se3.camera_in_body(config), config.bolometer_lag)
+        self._history = FrameHistory(track, Focus.as_declared(config.blur_px))
 
     def set_map(
         self, marker_map: Mapping[int, tuple[FloatArray, float]], quarantined: Collection[int] = frozenset()
     ) -> None:
         """Set the known markers: ID to (T_map_marker, side [m]), and the IDs that are not expected at their places."""
         self._known = KnownMarkers(marker_map, self._sizes, quarantined)
+
+    @property
+    def focus(self) -> Focus:
+        """Of the camera, as far as markers have shown it."""
+        return self._history.focus
 
     def size(self, marker_id: int) -> float:
         """Side of a marker [m]: from the map, else from the overrides, else the common one."""
@@ -97,7 +104,7 @@ class MarkerDetector:
         guide = by_odometry if config.guided and len(known.ids) else None
         T_camera_map = None if by_odometry is None else by_odometry.T_camera_map
         keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
-        frame = Frame.of(stamp_ns, counts, camera, twist, config, keep_columns=keep_columns)
+        frame = Frame.of(stamp_ns, counts, camera, twist, config, history.focus.blur_px, keep_columns=keep_columns)
         found, history = self._finder.find(frame, history, known, guide, config)
         refined, gray_scale = self._refined(frame, found, history)
         if len(found.ids) > 1 and not len(refined.ids) and refined.blur.to_tails is not None:
@@ -119,13 +126,24 @@ class MarkerDetector:
         twist = refined.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], known.sizes[ids])
         markers = ExpectedMarkers(ids, refined.places.points.x, depth, corners.contrast / frame.noise)
-        self._history = history.after(stamp_ns, twist, markers, gray_scale, saw_partial=len(rows) > len(ids))
+        focus = self._focus(frame, refined, history.focus)
+        self._history = history.after(stamp_ns, twist, markers, focus, gray_scale, saw_partial=len(rows) > len(ids))
         return rows
 
     def _refined(self, frame: Frame, found: FoundMarkers, history: FrameHistory) -> tuple[RefinedMarkers, GrayScale]:
         """Those of the markers ``found`` that are confirmed at their refined corners, and the gray scale."""
         refined, gray_scale = refine(frame, found, history.track, history.gray_scale, self._decoder)
         return confirmed(frame, found, refined, self._decoder, self.config), gray_scale
+
+    def _focus(self, frame: Frame, refined: RefinedMarkers, focus: Focus) -> Focus:
+        """The ``focus`` with what the markers of a frame show of it, where its motion and its gray scale are known."""
+        if frame.displayed or refined.twist is None or not focus.due(frame.stamp_ns):
+            return focus
+        whole = refined.only(~refined.corners.small)
+        if len(whole.ids) == 0:
+            return focus
+        corners = whole.places.points.at_pixels(whole.observed.corners_px)
+        return focus.after(frame.stamp_ns, shown_blur(frame, corners, whole.blur, self._decoder.cells))
 
     def _poses(
         self, ids: IntArray, covariances: FloatArray, points: ImagePoints, T_camera_map: FloatArray | None

@@ -243,7 +243,9 @@ def test_what_a_display_saturates_is_no_count(cell, lag_blur, white, allowed):
     decoder, image, corners = lagging(cell, lag_blur, beyond=0.3)
     noise = np.random.default_rng(0).normal(0.0, 0.7, image.shape)
     gray = np.clip(np.rint(20.0 + 235.0 * image / white + noise), 0, 255).astype(np.uint8)
-    frame = Frame.of(0, gray, Camera(*gray.shape[::-1], np.eye(3)), None, ArucoDetectorConfig(), keep_columns=True)
+    frame = Frame.of(
+        0, gray, Camera(*gray.shape[::-1], np.eye(3)), None, ArucoDetectorConfig(), 0.66, keep_columns=True
+    )
     lag = np.broadcast_to(lag_blur, corners.shape)
     there, to_tails, spread = (
         corners + REMAINING * lag,

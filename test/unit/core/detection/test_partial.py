@@ -109,7 +109,7 @@ def test_a_gray_scale_displaces_no_corner_in_a_turn(view, bent, white):
     """Counts to a power, as whole markers have shown it, or white from a share of the contrast on."""
     camera, (image, T, twist) = CAMERAS['plumb_bob'], turning(view, 1.0)
     gray = np.rint(20.0 + 235.0 * np.clip(image / white, 0.0, 1.0) ** bent).astype(np.uint8)
-    frame = Frame.of(0, gray, camera, twist, replace(CONFIG, bolometer_lag=LAG), keep_columns=True)
+    frame = Frame.of(0, gray, camera, twist, replace(CONFIG, bolometer_lag=LAG), CONFIG.blur_px, keep_columns=True)
     counts = 235.0 * (np.clip(np.arange(256) - 20.0, 0.0, None) / 235.0) ** (1.0 / bent)
     ids, found = look_at(frame, T, scale=GrayScale(counts, slice(20, 256)))
     assert ids.tolist() == [ID]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from thermal_fiducial.core.detection.corners.focus import Focus
 from thermal_fiducial.core.detection.corners.gray_scale import UNKNOWN_SCALE
 from thermal_fiducial.core.detection.finding.finder import FrameHistory
 from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers
@@ -10,14 +11,16 @@ from thermal_fiducial.core.detection.prediction.tracking import MotionTrack
 
 BOTH = 1.0, -1.0
 
+FOCUS = Focus.as_declared(0.66)
+
 
 def seen(*frames):
     """The history after frames with markers of such contrast-to-noise ratios."""
-    history = FrameHistory(MotionTrack(np.eye(4), 0.0))
+    history = FrameHistory(MotionTrack(np.eye(4), 0.0), FOCUS)
     for index, cnr in enumerate(frames):
         count = len(cnr)
         markers = ExpectedMarkers(np.arange(count), np.zeros((count, 4, 2)), np.ones((count, 4)), np.array(cnr))
-        history = history.after(index * 33_333_333, None, markers, UNKNOWN_SCALE, saw_partial=False)
+        history = history.after(index * 33_333_333, None, markers, FOCUS, UNKNOWN_SCALE, saw_partial=False)
     return history
 
 
@@ -52,7 +55,7 @@ def test_kinds_are_forgotten_when_none_is_seen(count):
 
 def test_stamps_that_go_back_forget_nothing():
     history = seen(*[[3.0]] * 100)
-    history = history.after(0, None, ExpectedMarkers.none(), UNKNOWN_SCALE, saw_partial=False)
+    history = history.after(0, None, ExpectedMarkers.none(), FOCUS, UNKNOWN_SCALE, saw_partial=False)
     assert history.polarities('alike') == (1.0,)
 
 

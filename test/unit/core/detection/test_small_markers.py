@@ -320,7 +320,7 @@ def test_markers_that_smoke_makes_unlike_their_patterns_show_the_motion():
     ids, px = np.array(sorted(corners)), np.array([corners[key] for key in sorted(corners)])
     depth, no = np.ones((len(ids), 4)), np.zeros(len(ids), dtype=bool)
     predicted = Twist(np.zeros(6), 0.3**2 * np.eye(6))
-    frame = Frame.of(round(dt * 1e9), picture, CAMERA, predicted, config, keep_columns=True)
+    frame = Frame.of(round(dt * 1e9), picture, CAMERA, predicted, config, config.blur_px, keep_columns=True)
     found = FoundMarkers(ids, Places.of(ImagePoints.at(px, CAMERA), depth), np.full(len(ids), 20.0), no, no)
     last = ExpectedMarkers(ids, ImagePoints.at(px - [3.0, 0.0], CAMERA).x, depth, np.full(len(ids), 20.0))
     track = MotionTrack(np.eye(4), config.bolometer_lag).after(0, predicted, last)

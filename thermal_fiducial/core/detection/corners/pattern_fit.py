@@ -36,6 +36,7 @@ from thermal_fiducial.core.detection.corners.corner_errors import (
     RefinedCorners,
     SURFACE_FALLS,
 )
+from thermal_fiducial.core.detection.corners.focus import BLURS, FOCUS_STD
 from thermal_fiducial.core.detection.corners.pattern_residuals import PatternResiduals, residuals_at
 from thermal_fiducial.core.detection.corners.side_fit import too_small_for_sides
 from thermal_fiducial.core.detection.corners.squares import as_squares
@@ -77,11 +78,10 @@ _SHAPE = 0.1
 _WIDE = 0.25
 # Smoothing of the image for it, in pixels and at most in cells; least width of cells [px].
 _SMOOTHING_PX, _SMOOTHING, _LEAST_CELL_PX = 1.0, 0.4, 0.5
-# Longest step of a corner [cells] and of the blur, and range of the blur, both in blurs of the optics.
-_LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.3, (0.5, 2.0)
-# Standard deviation of the blur, in blurs of the optics: the focus. That of the corners from where they are looked for
-# [cells].
-_FOCUS, _START = 0.3, 0.5
+# Longest step of a corner [cells] and of the blur [blurs of the optics].
+_LONGEST, _LONGEST_BLUR = 0.6, 0.3
+# Standard deviation of the corners from where they are looked for [cells].
+_START = 0.5
 # Standard deviations of amounts that are small, as shares of the contrast: in counts, and in pictures for a display.
 _LEVEL_STD, _BENDS_STD = LEVEL_BENDS / LARGEST_OF_LEVEL, np.full(BENDS, GRAY_BENDS)
 _SMALL_STD = (
@@ -126,7 +126,7 @@ class _Prior(NamedTuple):
         """Inverse variances (Q, K), for samples with a variance of 1."""
         precision = np.zeros(residuals.J.shape[:2])
         precision[:, CORNERS] = 1.0 / self.corners_std[:, None] ** 2
-        precision[:, BLUR] = 1.0 / (_FOCUS * self.blur_px) ** 2
+        precision[:, BLUR] = 1.0 / (FOCUS_STD * self.blur_px) ** 2
         of_contrast = 1.0 / (residuals.contrast * residuals.contrast + TINY)
         small = _SMALL_STD[residuals.unevenness is not None]
         precision[:, LINEAR][:, SMALL] = (1.0 / small) ** 2 * of_contrast[:, None]
@@ -353,7 +353,7 @@ def _moved(residuals: PatternResiduals, step: FloatArray, blur_px: float | Float
     longest = _LONGEST * (residuals.apart_px / residuals.grid.apart)[:, None]
     corners = residuals.corners_px + np.clip(step[:, CORNERS], -longest, longest).reshape(-1, 2, 4).swapaxes(1, 2)
     wider = np.clip(step[:, BLUR], -_LONGEST_BLUR * blur_px, _LONGEST_BLUR * blur_px)
-    return corners, np.clip(residuals.blur + wider, _BLURS[0] * blur_px, _BLURS[1] * blur_px)
+    return corners, np.clip(residuals.blur + wider, BLURS[0] * blur_px, BLURS[1] * blur_px)
 
 
 def _verdicts(

@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.corners.focus import Focus
 from thermal_fiducial.core.detection.corners.gray_scale import GrayScale, UNKNOWN_SCALE
 from thermal_fiducial.core.detection.corners.refining import CLEAR_CNR
 from thermal_fiducial.core.detection.finding.drifted import drifted_markers
@@ -55,6 +56,8 @@ class FrameHistory:
     """What a frame needs from the frames before it."""
 
     track: MotionTrack
+    #: of the camera, as far as it is known
+    focus: Focus
     #: surplus of dark over bright markers, with exponential forgetting, at most that of one marker a frame
     balance: float = 0.0
     #: whether the last frame showed markers that are partially visible
@@ -66,7 +69,14 @@ class FrameHistory:
     gray_scale: GrayScale = UNKNOWN_SCALE
 
     def after(
-        self, stamp_ns: int, twist: Twist | None, markers: ExpectedMarkers, gray_scale: GrayScale, *, saw_partial: bool
+        self,
+        stamp_ns: int,
+        twist: Twist | None,
+        markers: ExpectedMarkers,
+        focus: Focus,
+        gray_scale: GrayScale,
+        *,
+        saw_partial: bool,
     ) -> 'FrameHistory':
         """The history that the frame after one with these starts from."""
         track = self.track.after(stamp_ns, twist, markers)
@@ -76,7 +86,7 @@ class FrameHistory:
         else:
             elapsed_ns = 0 if before_ns is None else max(stamp_ns - before_ns, 0)
             balance = self.balance * math.exp(-elapsed_ns / (_REMEMBERED_S * SECOND_NS))
-        return FrameHistory(track, balance, saw_partial, self.searched_ns, self.scales, gray_scale)
+        return FrameHistory(track, focus, balance, saw_partial, self.searched_ns, self.scales, gray_scale)
 
     def polarities(self, rule: str) -> tuple[float, ...]:
         """Possible ones by the parameter ``polarity``: 1 for markers darker than their background, -1 for brighter."""

@@ -93,13 +93,14 @@ class Frame:
         camera: Camera,
         twist: Twist | None,
         config: ArucoDetectorConfig,
+        blur_px: float,
         *,
         keep_columns: bool,
     ) -> 'Frame':
-        """A frame; the fixed pattern of its columns is removed unless ``keep_columns``."""
+        """A frame, blurred by ``blur_px``; the fixed pattern of its columns is removed unless ``keep_columns``."""
         noise, displayed = pixel_noise(counts), bool(counts[::_ROW_STEP].max() < _LEVELS)
         pixels = counts if keep_columns else with_columns_corrected(counts.astype(np.float32), noise)
-        lag, readout, blur_px = config.bolometer_lag, config.readout_time, config.blur_px
+        lag, readout = config.bolometer_lag, config.readout_time
         return Frame(stamp_ns, pixels, noise, camera, twist, lag, readout, blur_px, counts, displayed)
 
     @cached_property
