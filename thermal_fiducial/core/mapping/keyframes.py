@@ -8,7 +8,7 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import divided_prior, draws_of, information_of_followed_map, SystematicErrors
 from thermal_fiducial.core.geometry.camera import by_other_calibration, Camera
-from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
@@ -98,13 +98,15 @@ def prior_poses(markers: Mapping[int, MapMarker]) -> dict[int, tuple[FloatArray,
 class Displacement:
     """Displacement of the map by an adjustment, which differs over the map after gaps and loop closures."""
 
-    #: (n,) of the adjusted keyframes, ascending
+    #: (n,) of the frames that see markers of the map, ascending
     stamps_ns: IntArray
-    #: (n, 4, 4) T_new_old near the keyframe of each
+    #: (n, 4, 4) T_new_old of the markers that each sees
     T_new_old: FloatArray
 
     def at(self, stamp_ns: int) -> FloatArray:
-        """T_new_old (4, 4) for poses at ``stamp_ns``: that of the keyframe nearest in time."""
+        """T_new_old (4, 4) for poses at ``stamp_ns``: that of the frame nearest in time."""
+        if len(self.stamps_ns) == 0:
+            return np.eye(4)
         after = int(np.searchsorted(self.stamps_ns, stamp_ns))
         near = [i for i in (after - 1, after) if 0 <= i < len(self.stamps_ns)]
         return np.asarray(self.T_new_old[min(near, key=lambda i: abs(int(self.stamps_ns[i]) - stamp_ns))])
@@ -219,18 +221,54 @@ class KeyframeStore:
         priors = prior_poses({key: marker for key, marker in self._before.items() if key in observed_ids})
         return snapshot_of(trusted, frames, self._camera, priors, marker_map.revision, errors, readout)
 
-    def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
-        """Take over adjusted poses by stamp; other keyframes move with the nearest adjusted one in time."""
-        stamps = sorted(adjusted.keys() & self.frames.keys())
-        if not stamps:
-            return Displacement(np.zeros(1, dtype=np.int64), np.eye(4)[None])
-        before = np.stack([self.frames[stamp].T_map_camera for stamp in stamps])
-        after = np.stack([adjusted[stamp] for stamp in stamps])
-        displacement = Displacement(np.array(stamps, dtype=np.int64), _rigid(after @ inverse(before)))
+    def move(
+        self, adjusted: Mapping[int, FloatArray], before: Mapping[int, MapMarker], after: Mapping[int, MapMarker]
+    ) -> Displacement:
+        """Take over adjusted poses by stamp; other keyframes move with the markers that they see.
+
+        What a pose was corrected by is no displacement of the map: the noise of one keyframe would move others.
+
+        Parameters
+        ----------
+        before, after : the map before the adjustment and after it
+        """
+        displacement = self._displacement(before, after)
         for stamp, frame in self.frames.items():
             T_map_camera = adjusted[stamp] if stamp in adjusted else displacement.at(stamp) @ frame.T_map_camera
             self.frames[stamp] = replace(frame, T_map_camera=T_map_camera)
         return displacement
+
+    def _displacement(self, before: Mapping[int, MapMarker], after: Mapping[int, MapMarker]) -> Displacement:
+        """By the markers that each keyframe sees: rigid alignments of their corners, of all keyframes at once."""
+        ids = sorted(key for key in before.keys() & after.keys() if before[key].trusted)
+        stamps, sees = np.array(list(self.frames), dtype=np.int64), self._sees(ids)
+        number = 4.0 * sees.sum(axis=1)
+        stamps, sees, number = stamps[number > 0.0], sees[number > 0.0], number[number > 0.0, None]
+        if len(stamps) == 0:
+            return Displacement(stamps, np.zeros((0, 4, 4)))
+        old, new = (_corners([markers[key] for key in ids]) for markers in (before, after))
+        # Sums of large numbers would lose digits.
+        middle = old.mean(axis=(0, 1))
+        old, new = old - middle, new - middle
+        centre_old, centre_new = (sees @ corners.sum(axis=1) / number for corners in (old, new))
+        products = (sees @ (new.swapaxes(1, 2) @ old).reshape(-1, 9)).reshape(-1, 3, 3)
+        U, _, Vt = np.linalg.svd(products - number[..., None] * centre_new[:, :, None] * centre_old[:, None])
+        U[..., 2] *= np.linalg.det(U @ Vt)[:, None]
+        T = np.broadcast_to(np.eye(4), (len(stamps), 4, 4)).copy()
+        T[:, :3, :3] = U @ Vt
+        T[:, :3, 3] = centre_new + middle - (T[:, :3, :3] @ (centre_old + middle)[..., None])[..., 0]
+        order = np.argsort(stamps, kind='stable')
+        return Displacement(stamps[order], T[order])
+
+    def _sees(self, ids: Sequence[int]) -> FloatArray:
+        """Which of the N markers ``ids``, ascending, each of n keyframes sees, (n, N): 1 or 0."""
+        frames = list(self.frames.values())
+        sees = np.zeros((len(frames), len(ids)))
+        shown = np.concatenate([frame.ids for frame in frames]) if frames else np.zeros(0, dtype=np.int64)
+        rows = np.repeat(np.arange(len(frames)), [len(frame.ids) for frame in frames])
+        known = np.isin(shown, ids)
+        sees[rows[known], np.searchsorted(ids, shown[known])] = 1.0
+        return sees
 
     def _keyframe(
         self, observed: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None
@@ -288,18 +326,16 @@ class KeyframeStore:
         return cells
 
 
+def _corners(markers: Sequence[MapMarker]) -> FloatArray:
+    """Corners (N, 4, 3) in the map [m]."""
+    poses, sizes = np.stack([m.T_map_marker for m in markers]), np.array([m.size for m in markers])
+    return corners_in_map(poses, sizes)
+
+
 def _where_known(rates: FloatArray, covariances: FloatArray) -> FloatArray:
     """Rates (k, 4, 2) of a frame, zero where odometry does not know its velocity."""
     known = np.sum(rates**2) > _SURE**2 * np.trace(covariances, axis1=-2, axis2=-1).sum()
     return rates if known else np.zeros_like(rates)
-
-
-def _rigid(T: FloatArray) -> FloatArray:
-    """Transforms (n, 4, 4) with orthonormal rotations: rounding errors would double with every product."""
-    U, _, Vt = np.linalg.svd(T[:, :3, :3])
-    result = T.copy()
-    result[:, :3, :3] = U @ Vt
-    return result
 
 
 def _fair_share(counts: list[int], room: int) -> int:

@@ -293,11 +293,12 @@ class MarkerMapper:
         """
         if self.frozen or refinement.map_revision < self._initial.revision:
             return False
+        before = dict(self.map.markers)
         self.map.adjust(refinement.markers)
         self._found = refinement.aspect
         self.readout.adopt(refinement.readout)
         self._consistency.quarantine(self.map.markers, refinement.inconsistent)
-        self._new.move(self._keyframes.move(refinement.keyframes))
+        self._new.move(self._keyframes.move(refinement.keyframes, before, self.map.markers))
         self.resets += 1
         return True
 

@@ -8,7 +8,7 @@ from support.walls import flight
 
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore
-from thermal_fiducial.core.mapping.map_data import MarkerMap
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 
 
 def frame(stamp, T):
@@ -55,28 +55,62 @@ def test_bridges_are_never_dropped():
     assert 3 in store.frames
 
 
-def test_frames_that_were_not_adjusted_move_with_the_nearest():
+def mapped(poses):
+    """Markers of 0.3 m by ID."""
+    return {key: MapMarker(key, 0.3, False, T) for key, T in poses.items()}
+
+
+def test_frames_that_were_not_adjusted_move_with_the_markers_that_they_see():
     """After a loop is closed, its beginning and its end move differently."""
     store = KeyframeStore(10, MarkerMap())
-    for k in range(6):
-        store.add(frame(k, transform(np.eye(3), [k, 0.0, 0.0])))
+    seen = {0: [1, 2], 1: [1], 2: [2, 9], 3: [9], 4: [3, 4], 5: [4]}
+    for k, ids in seen.items():
+        store.add(replace(frame(k, transform(np.eye(3), [k, 0.0, 0.0])), ids=np.array(ids)))
     early, late = transform(np.eye(3), [0.0, 0.1, 0.0]), transform(so3_exp([0.0, 0.0, 0.1]), [0.5, 0.0, 0.0])
-    moves = {0: early, 1: early, 2: early, 3: late, 4: late, 5: late}
-    moved = store.move({k: moves[k] @ store.frames[k].T_map_camera for k in (1, 4)})
-    for k, T in moves.items():
+    before = mapped({key: transform(so3_exp([0.1 * key, 0.0, 0.2]), [5.0 + key, 2.0, 1.0]) for key in (1, 2, 3, 4)})
+    moves = {1: early, 2: early, 3: late, 4: late}
+    after = {key: replace(marker, T_map_marker=moves[key] @ marker.T_map_marker) for key, marker in before.items()}
+    adjusted = {4: transform(np.eye(3), [7.0, 0.0, 0.0])}
+    moved = store.move(adjusted, before, after)
+    # Frame 3 sees no marker of the map: it moves with the nearest that does.
+    for k, T in {0: early, 1: early, 2: early, 3: early, 5: late}.items():
         np.testing.assert_allclose(moved.at(k), T, atol=1e-12)
         np.testing.assert_allclose(store.frames[k].T_map_camera, T @ transform(np.eye(3), [k, 0.0, 0.0]), atol=1e-12)
+    np.testing.assert_array_equal(store.frames[4].T_map_camera, adjusted[4])
     np.testing.assert_allclose(moved.at(1000), late, atol=1e-12)
-    np.testing.assert_array_equal(store.move({99: early}).at(3), np.eye(4))
 
 
-def test_a_frame_of_a_repeated_stamp_does_not_move_the_map():
-    """A simulation begins once more while an adjustment is under way: the robot has moved, the map has not."""
+def test_what_a_pose_is_corrected_by_is_no_displacement_of_the_map():
+    """A pose that was 0.2 m off when it was kept moved another one, which was not, by as much."""
+    store = KeyframeStore(10, MarkerMap())
+    good = transform(so3_exp([0.3, 0.0, 0.0]), [1.0, 0.0, 0.0])
+    for k in range(2):
+        store.add(replace(frame(k, good), ids=np.array([1])))
+    markers = mapped({1: transform(np.eye(3), [3.0, 0.0, 1.0])})
+    moved = store.move({1: transform(np.eye(3), [0.2, 0.0, 0.0]) @ good}, markers, markers)
+    np.testing.assert_allclose(store.frames[0].T_map_camera, good, atol=1e-12)
+    np.testing.assert_allclose(moved.at(1), np.eye(4), atol=1e-12)
+
+
+def test_markers_in_quarantine_and_an_empty_map_move_nothing():
+    store = KeyframeStore(10, MarkerMap())
+    assert np.array_equal(store.move({}, {}, {}).at(3), np.eye(4))
+    store.add(frame(0, np.eye(4)))
+    before = mapped({1: np.eye(4), 2: transform(np.eye(3), [1.0, 0.0, 0.0])})
+    before[2] = replace(before[2], trusted=False)
+    shift = transform(np.eye(3), [0.0, 0.1, 0.0])
+    # What an adjustment moves is what is trusted.
+    after = {1: replace(before[1], T_map_marker=shift), 2: before[2]}
+    np.testing.assert_allclose(store.move({}, before, after).at(0), shift, atol=1e-12)
+    assert np.array_equal(store.move({}, {7: before[1]}, {7: after[1]}).at(0), np.eye(4))
+
+
+def test_a_frame_of_a_repeated_stamp_is_not_kept():
+    """A simulation begins once more while an adjustment is under way: that has the pose of the first one."""
     store = KeyframeStore(10, MarkerMap())
     store.add(frame(0, np.eye(4)))
     store.add(frame(0, transform(np.eye(3), [1.0, 0.0, 0.0])))
-    shift = transform(np.eye(3), [0.0, 0.001, 0.0])
-    np.testing.assert_allclose(store.move({0: shift}).at(0), shift, atol=1e-12)
+    np.testing.assert_array_equal(store.frames[0].T_map_camera, np.eye(4))
 
 
 def test_rotations_stay_rotations_however_often_the_map_moves():
@@ -85,9 +119,10 @@ def test_rotations_stay_rotations_however_often_the_map_moves():
     store = KeyframeStore(10, MarkerMap())
     for k in range(6):
         store.add(frame(k, transform(so3_exp(rng.normal(size=3)), rng.normal(size=3))))
+    markers = mapped({key: transform(so3_exp(rng.normal(size=3)), rng.normal(size=3)) for key in (1, 2)})
     for _ in range(300):
-        stamps = rng.choice(6, 4, replace=False).tolist()
-        steps = {k: transform(so3_exp(0.01 * rng.normal(size=3)), 0.01 * rng.normal(size=3)) for k in stamps}
-        moved = store.move({k: step @ store.frames[k].T_map_camera for k, step in steps.items()})
+        step = transform(so3_exp(0.01 * rng.normal(size=3)), 0.01 * rng.normal(size=3))
+        after = {key: replace(marker, T_map_marker=step @ marker.T_map_marker) for key, marker in markers.items()}
+        moved, markers = store.move({}, markers, after), after
         R = np.stack([f.T_map_camera[:3, :3] for f in store.frames.values()] + [moved.at(3)[:3, :3]])
         np.testing.assert_allclose(np.swapaxes(R, -1, -2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
