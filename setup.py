@@ -85,7 +85,7 @@ setup(
     entry_points={
         'console_scripts': [
             *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in NODES),
-            f'thermal-fiducial = {PACKAGE}.cli.main:main',
+            f'thermal-fiducial = {PACKAGE}.__main__:main',
         ],
     },
 )

@@ -5,7 +5,6 @@ import errno
 from importlib import import_module
 from io import TextIOWrapper
 import os
-import signal
 import sys
 
 from thermal_fiducial import __version__
@@ -62,8 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     _replace_closed_streams()
     _allow_any_letter()
-    # All is cleared up then: a further interrupt may end the process in the middle of the interpreter's own end.
-    with Interrupts(held=False, behind=signal.SIG_DFL if argv is None else None) as interrupts:
+    with Interrupts(held=False) as interrupts:
         return _finished(words, interrupts)
 
 

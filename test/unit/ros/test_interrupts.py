@@ -123,6 +123,7 @@ def test_a_second_one_at_the_very_end_prints_no_traceback():
     done = finished(
         """
 import os, signal, sys
+from thermal_fiducial.__main__ import main
 from thermal_fiducial.cli import main as program
 
 own, calls = signal.signal, []
@@ -133,14 +134,40 @@ def press(*_):
 def press_behind_the_end(number, handler):
     before = own(number, handler)
     calls.append(handler)
-    if len(calls) == 2:
+    if len(calls) == 3:
         press()
     return before
 
 own(signal.SIGINT, signal.default_int_handler)
 signal.signal, program._run = press_behind_the_end, press
-sys.exit(program.main())
+sys.exit(main())
 """,
         'replay',
     )
     assert (done.returncode, done.stderr) == (-signal.SIGINT, 'thermal-fiducial replay: interrupted\n')
+
+
+SAID = (130, 'thermal-fiducial map: interrupted\n')
+
+
+@pytest.mark.parametrize(
+    ('module', 'ended'), [('thermal_fiducial.cli.parser', (-signal.SIGINT, '')), ('thermal_fiducial.cli.map', SAID)]
+)
+def test_one_during_the_imports_prints_no_traceback(module, ended):
+    """In the first 0.1 s, before there is anything to clear up, or to say."""
+    done = finished(
+        f"""
+import os, runpy, signal, sys
+
+class Pressing:
+    def find_spec(self, name, *_):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Pressing())
+sys.argv = ['thermal-fiducial', 'map', 'show', 'hall.yaml']
+runpy.run_module('thermal_fiducial', run_name='__main__')
+"""
+    )
+    assert (done.returncode, done.stderr) == ended

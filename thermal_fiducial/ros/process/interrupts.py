@@ -22,12 +22,10 @@ class Interrupts:
     Parameters
     ----------
     held : raise only from :meth:`check` and at the end; else anywhere, but not again within :data:`PAUSE_S`
-    behind : what handles SIGINT behind an interrupt; None: what did before. Where the process ends then, Python's
-        default would print a traceback of one that comes at once
     """
 
-    def __init__(self, *, held: bool, behind: signal.Handlers | None = None) -> None:
-        self._held, self._behind = held, behind
+    def __init__(self, *, held: bool) -> None:
+        self._held = held
         self._raised_s = -PAUSE_S
         self._before: Any = None
         #: whether Ctrl-C has been pressed
@@ -55,7 +53,7 @@ class Interrupts:
         self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
     ) -> None:
         if self._before is not None:
-            signal.signal(signal.SIGINT, self._behind if self.asked and self._behind is not None else self._before)
+            signal.signal(signal.SIGINT, self._before)
         if self._held and kind is not KeyboardInterrupt:
             # Errors are consequences of it, such as that of a node that has had it too.
             self.check()
