@@ -1,6 +1,6 @@
 """Data of the recorded messages that are not in the text files of a run folder."""
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,17 +20,27 @@ _POSE, _DIAGNOSTICS = 'pose', 'diagnostics'
 _WITHHELD = 'withheld: '
 # "coasting: 0.6 s without a pose" and "coasting: 0.8 s without a pose" are counted as the same message.
 _NUMBER = re.compile(r'\d+(\.\d+)?')
-_LEVELS = ('ok', 'warning', 'error', 'stale')
+WARNING = 'warning'
+_LEVELS = ('ok', WARNING, 'error', 'stale')
 
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """Count of a diagnostic message of a node."""
+    """A diagnostic message of a node, which may have come several times."""
 
     node: str
     level: str
+    #: with N for each number
     message: str
-    count: int
+    #: as it was said last, with its numbers
+    latest: str
+    #: when it came, by the clock of the bag [ns]
+    times_ns: tuple[int, ...]
+
+    @property
+    def count(self) -> int:
+        """How often it was said."""
+        return len(self.times_ns)
 
 
 @dataclass(frozen=True)
@@ -103,7 +113,7 @@ def read_output(path: Path, offset_ns: int) -> RecordedOutput:
         return RecordedOutput(
             stamps_ns=stamps,
             covariances=covariances,
-            diagnostics=_diagnostics(statuses),
+            diagnostics=_diagnostics(arrays),
             innovations=_innovations(statuses, offset_ns),
             frames_ns=_arrivals(bag, MARKERS_TOPIC, offset_ns).stamps_ns,
             withheld=_withheld(arrays),
@@ -127,12 +137,17 @@ def _arrivals(bag: BagReader, topic: str, offset_ns: int) -> Arrivals:
     return Arrivals(stamps, times)
 
 
-def _diagnostics(statuses: Iterable[Any]) -> tuple[Diagnostic, ...]:
-    said: Counter[tuple[str, str, str]] = Counter()
-    for status in statuses:
-        level = status.level[0] if isinstance(status.level, (bytes, np.ndarray)) else status.level
-        said[status.name, _LEVELS[min(int(level), 3)], _NUMBER.sub('N', status.message)] += 1
-    return tuple(Diagnostic(*key, count) for key, count in said.most_common())
+def _diagnostics(arrays: Sequence[tuple[int, Any]]) -> tuple[Diagnostic, ...]:
+    times: defaultdict[tuple[str, str, str], list[int]] = defaultdict(list)
+    latest: dict[tuple[str, str, str], str] = {}
+    for time_ns, array in arrays:
+        for status in array.status:
+            level = status.level[0] if isinstance(status.level, (bytes, np.ndarray)) else status.level
+            key = status.name, _LEVELS[min(int(level), 3)], _NUMBER.sub('N', status.message)
+            times[key].append(time_ns)
+            latest[key] = status.message
+    said = [Diagnostic(*key, latest[key], tuple(when)) for key, when in times.items()]
+    return tuple(sorted(said, key=lambda one: -one.count))
 
 
 def _innovations(statuses: Iterable[Any], offset_ns: int) -> Innovations:

@@ -4,8 +4,11 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+from thermal_fiducial.core.filter.output import TRACKING
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.evaluation import Evaluation
+from thermal_fiducial.report.output_bag import Diagnostic, WARNING
 
 #: NEES per degree of freedom up to which covariances are consistent, and above which they are far too small.
 CONSISTENT_NEES, INCONSISTENT_NEES = 2.0, 4.0
@@ -19,6 +22,8 @@ SHORT_PAUSE_MS, LONG_PAUSE_MS = 100.0, 500.0
 LONG_COAST_S = 2.0
 #: Step of the pose that causes a jerk of a position controller [mm].
 LARGE_STEP_MM = 50.0
+#: Diagnostics, one a second, from which on a warning lasts: what one frame, a start or an end causes is over before.
+LASTING_WARNING = 3
 #: Latency above which a pose is of little use to an autopilot [ms].
 LATE_MS = 20.0
 
@@ -78,6 +83,7 @@ def judge(evaluation: Evaluation, numbers: dict[str, Any]) -> RunVerdict:
         _latency(numbers),
         _resets(evaluation),
         _markers(evaluation),
+        _warnings(evaluation),
     ]
     remarks = sorted((remark for remark in made if remark), key=lambda remark: -remark.weight)
     return RunVerdict(tuple(remarks))
@@ -191,3 +197,30 @@ def _markers(evaluation: Evaluation) -> Remark | None:
     if quarantined:
         return Remark(Weight.DOUBT, f'Markers {", ".join(quarantined)} contradict the map.')
     return None
+
+
+def _warnings(evaluation: Evaluation) -> Remark | None:
+    """What the nodes warned of for seconds: a wrong lens or map shows there, and in no figure without ground truth."""
+    lasting = [
+        (said, seconds)
+        for said in evaluation.run.output.diagnostics
+        if _is_doubt(said) and (seconds := _seconds_with_poses(said, evaluation)) >= LASTING_WARNING
+    ]
+    if not lasting:
+        return None
+    (first, seconds), *others = lasting
+    more = f' and {number_of(len(others), "more warning")}' if others else ''
+    return Remark(Weight.DOUBT, f'For {seconds} s {first.node} warned: "{first.latest}"{more}.')
+
+
+def _is_doubt(said: Diagnostic) -> bool:
+    """Whether it is a warning, and of nothing that the filter says of missing or refused poses: they have remarks."""
+    doubt = f'{TRACKING}; '
+    own = said.message.startswith(doubt) and not said.message.startswith(f'{doubt}pose ')
+    return said.level == WARNING and (own or said.node.rpartition('/')[2] != 'pose_ekf')
+
+
+def _seconds_with_poses(said: Diagnostic, evaluation: Evaluation) -> int:
+    """How often it was said, once a second, while there were poses from markers: other times have remarks."""
+    spans = [(entry.start_ns, entry.end_ns + SECOND_NS) for entry in evaluation.interruptions]
+    return sum(not any(start <= time <= end for start, end in spans) for time in said.times_ns)

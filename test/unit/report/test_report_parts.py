@@ -29,7 +29,7 @@ from thermal_fiducial.report.charts import clock_chart, error_charts
 from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.map_error import map_accuracy, marker_errors
 from thermal_fiducial.report.marker_table import tags
-from thermal_fiducial.report.output_bag import Arrivals, RecordedOutput
+from thermal_fiducial.report.output_bag import Arrivals, Diagnostic, RecordedOutput
 from thermal_fiducial.report.picture import draw_error
 from thermal_fiducial.report.run_folder import read_run
 from thermal_fiducial.report.stacked_plots import TimePlots
@@ -251,6 +251,48 @@ def test_what_speaks_against_a_run(tmp_path, path, value, weight, words):
     verdict = judge(evaluation, with_value(GOOD, path, value))
     assert (verdict.weight, verdict.headline) == (weight, HEADLINES[weight])
     assert words in verdict.remarks[0].text
+
+
+def judged(tmp_path, *said, gap=0.0):
+    """The verdict on a run without faults in which this was said: (node, level, message, count), once a second.
+
+    Markers are out of view in the last ``gap`` [s].
+    """
+    diagnostics = [
+        Diagnostic(*words, words[-1], tuple(START_NS + (1 + k) * 10**9 for k in range(count))) for *words, count in said
+    ]
+    output = RecordedOutput(diagnostics=tuple(diagnostics))
+    run = run_of(tmp_path, trajectory(200.0), trajectory(30.0, SECONDS - gap), truth=None, output=output)
+    return judge(evaluate(run), GOOD)
+
+
+def test_what_nodes_warn_of_for_seconds_speaks_against_a_run(tmp_path):
+    """A focal length 2 % too long: 62 mm off at a claim of 7 mm, and green, as nothing else shows it without truth."""
+    misfit = 'marker_mapper', 'warning', 'corners are not where map and calibration have them', 5
+    leaning = 'pose_ekf', 'warning', 'tracking; the map leans', 3
+    assert judged(tmp_path, misfit).headline == HEADLINES[Weight.DOUBT]
+    words = 'For 5 s marker_mapper warned: "corners are not where map and calibration have them" and 1 more warning.'
+    assert judged(tmp_path, misfit, leaning).remarks[0].text == words
+
+
+@pytest.mark.parametrize(
+    'said',
+    [
+        ('marker_mapper', 'warning', 'quarantined: 4', 2),
+        ('aruco_detector', 'ok', '8 markers', 9),
+        ('aruco_detector', 'error', 'nothing on thermal/image', 9),
+        ('/drone/pose_ekf', 'warning', 'coasting: 0.8 s without a pose', 9),
+        ('pose_ekf', 'warning', 'tracking; pose refused: 7.1 sigma', 9),
+    ],
+)
+def test_what_nodes_say_of_normal_operation_or_of_missing_poses_is_no_further_doubt(tmp_path, said):
+    assert judged(tmp_path, said).weight == Weight.NOTE  # that there is no truth
+
+
+def test_a_warning_while_no_marker_is_in_view_is_no_further_doubt(tmp_path):
+    said = 'marker_mapper', 'warning', 'no known marker in view', 11
+    assert 'warned' not in ' '.join(remark.text for remark in judged(tmp_path, said, gap=9.5).remarks)
+    assert 'For 4 s marker_mapper warned' in ' '.join(remark.text for remark in judged(tmp_path, said, gap=7.5).remarks)
 
 
 @pytest.mark.parametrize('columns', [60, 80, 200])
