@@ -158,7 +158,11 @@ def _rolling(
         readout = state.readout
         corners = [frame.corners for frame in solved]
         shifts, initial = _row_shifts(corners, camera, problem, state), [pose.T_map_camera for pose in poses]
-        solved = _solved(corners, camera, shifts, initial)
+        # The camera has seen them: what takes them out of its view, or away from their marker, is no motion of it.
+        shown = all(np.isfinite(shift).all() for shift in shifts)
+        solved = _solved(corners, camera, shifts, initial) if shown else []
+        if len(solved) < len(corners) / 2:
+            raise _contradiction(state)
     return solved, problem, solution
 
 
@@ -262,17 +266,22 @@ class _RigRecording:
         return np.array([(pose.stamp_ns - self.start_ns) * 1e-9 for pose in poses])
 
 
-def _answer(solution: Solution, readout_sigma: float) -> CameraImuCalibration:
-    """The result; raises InputError where only an IMU that none is explains what the camera shows."""
-    state = solution.state
+def _contradiction(state: State) -> InputError:
+    """That only an IMU that none is explains what the camera shows, and the sensor that is off by most."""
     worst = int(np.argmax(np.abs(state.axes)))
-    if abs(state.axes[worst]) > _OFF_AXES:
-        sensor = 'gyroscope' if worst < GYROSCOPE_AXES else 'accelerometer'
-        raise InputError(
-            f'IMU and camera contradict each other, the {sensor} by {100.0 * abs(state.axes[worst]):.0f} %: axes, sign '
-            'and units of the IMU, two IMUs on its topic, sides and places of the map, the lens, clocks that are more '
-            f'than {LARGEST_OFFSET:g} s apart?'
-        )
+    sensor = 'gyroscope' if worst < GYROSCOPE_AXES else 'accelerometer'
+    return InputError(
+        f'IMU and camera contradict each other, the {sensor} by {100.0 * abs(state.axes[worst]):.0f} %: axes, sign '
+        'and units of the IMU, two IMUs on its topic, sides and places of the map, the lens, clocks that are more '
+        f'than {LARGEST_OFFSET:g} s apart?'
+    )
+
+
+def _answer(solution: Solution, readout_sigma: float) -> CameraImuCalibration:
+    """The result; raises InputError where IMU and camera contradict each other."""
+    state = solution.state
+    if np.abs(state.axes).max() > _OFF_AXES:
+        raise _contradiction(state)
     return CameraImuCalibration(
         se3.transform(state.R_body_camera, state.p_body_camera),
         state.offset,

@@ -310,6 +310,23 @@ def test_a_map_that_is_not_the_one_in_view_is_named():
         calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, IMU)
 
 
+def test_an_imu_of_the_other_sign_is_refused_before_corners_are_moved_along_its_motion():
+    """They left all bounds: "Eigenvalues did not converge", with a traceback."""
+    frames, camera, imu = rolling_recording(SCENARIO, 13.0, 1, 0.0, sigma_px=0.1)
+    with pytest.raises(InputError, match='contradict each other'):
+        calibrate_rolling_camera_imu(frames[::3], camera, replace(imu, rate=-imu.rate), START_NS, IMU)
+
+
+@pytest.mark.parametrize('share', [1.0, pytest.param(0.1, marks=pytest.mark.nightly)])
+def test_densities_that_are_too_small_contradict_nothing(share):
+    """Scale errors take up what is declared away, before the noise of the samples is known: 14 % of a shaken IMU."""
+    noise = ImuNoise(*(share * value for value in astuple(ImuNoise())[:6]))
+    frames, camera, imu = rolling_recording(replace(SCENARIO, imu=named('rough').imu), 20.0, 1, 0.0, sigma_px=0.1)
+    result = calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, noise)
+    # True ones are zero, 0.3 % is what 20 s leave.
+    assert np.abs(result.axes).max() < 0.01
+
+
 @pytest.mark.parametrize('readout', [pytest.param(0.0, marks=pytest.mark.nightly), READOUT])
 def test_readout_time_and_extrinsics_within_their_errors(readout):
     frames, camera, imu = rolling_recording(SCENARIO, 15.0, 1, readout, sigma_px=0.1)
