@@ -222,8 +222,9 @@ class _RigRecording:
         Raises
         ------
         InputError
-            Too few.
+            Too few, or an axis of the IMU that never changes.
         """
+        self.imu.require_signals()
         stamps, margin = self._seconds(poses), LARGEST_OFFSET + 0.05
         inside = (stamps > self.imu.seconds[0] + margin) & (stamps < self.imu.seconds[-1] - margin)
         inside[1:] &= np.diff(stamps) > 1e-4

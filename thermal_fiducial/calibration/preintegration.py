@@ -14,6 +14,7 @@ from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.filter.imu_noise import bias_walks
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
 
 # Longest step of the integration [s]: the sampling interval of a 200 Hz IMU.
 _STEP = 0.005
@@ -60,6 +61,12 @@ class ImuTrack:
             for signal in (self.rate, self.force)
         )
         return rate.reshape(*t.shape, 3), force.reshape(*t.shape, 3)
+
+    def require_signals(self) -> None:
+        """Raise InputError if an axis never changes: its sensor is dead, or the driver does not fill it in."""
+        # Rounding gives a constant that is not zero a deviation of its last digits.
+        if np.any(np.ptp(np.hstack([self.rate, self.force]), axis=0) == 0.0):
+            raise InputError('an axis of the IMU says the same all the time')
 
     def averaged(self, seconds: float) -> 'ImuTrack':
         """Samples averaged over a window of ``seconds`` about each: the motion without vibration."""

@@ -6,6 +6,7 @@ import re
 
 from builtin_interfaces.msg import Time
 import cv2
+from geometry_msgs.msg import Vector3
 import numpy as np
 import pytest
 from std_msgs.msg import Header
@@ -152,6 +153,8 @@ def test_camera_against_imu_refuses_a_calibration_of_another_size(tmp_path, caps
         (CAMERA_INFO_TOPIC, {'k': np.zeros(9)}, 'camera matrix without a focal length'),
         (IMAGE_TOPIC, {'encoding': 'bgr8'}, "image of encoding 'bgr8'"),
         (CAMERA_INFO_TOPIC, {'width': 320, 'height': 256}, 'image of 640x512, camera_info of 320x256'),
+        # Without turn rates the adjustment has no solution.
+        (IMU_TOPIC, {'angular_velocity': Vector3()}, 'an axis of the IMU says the same all the time'),
     ],
 )
 def test_camera_against_imu_names_the_bag_of_what_it_cannot_use(tmp_path, topic, fields, words, capsys):
