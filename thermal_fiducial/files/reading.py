@@ -15,6 +15,8 @@ TEXT_LIMIT_BYTES = 6_000_000
 LINE_LIMIT_BYTES = 10_000
 #: Most consecutive blank lines of a table.
 _BLANK_LINES = 100_000
+#: Of a picture or an archive, or of a text as some editors save it: with umlauts in Latin-1, or all in UTF-16.
+_NOT_UTF_8 = 'no text in UTF-8 (an editor can save it as such)'
 #: Longest path or other name in an error message [characters].
 _LONGEST_NAME = 400
 
@@ -102,10 +104,12 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT_BYTES) -> str:
     InputError
         As :func:`read_bytes`, or not UTF-8.
     """
+    content = read_bytes(path, limit)
     try:
-        return read_bytes(path, limit).decode('utf-8')
-    except UnicodeDecodeError:
-        raise InputError(f'{path}: not a text file') from None
+        return content.decode('utf-8')
+    except UnicodeDecodeError as error:
+        line = content.count(b'\n', 0, error.start) + 1
+        raise InputError(f'{path}: line {line}: {_NOT_UTF_8}') from None
 
 
 def text_lines(path: str | Path, limit: int) -> Iterator[tuple[int, str]]:
@@ -128,7 +132,7 @@ def text_lines(path: str | Path, limit: int) -> Iterator[tuple[int, str]]:
                 # Spreadsheets begin a file with a byte order mark.
                 line = data.decode('utf-8-sig').strip()
             except UnicodeDecodeError:
-                raise InputError(f'{path}: line {number} is not text') from None
+                raise InputError(f'{path}: line {number}: {_NOT_UTF_8}') from None
             if line:
                 last = number
                 yield number, line

@@ -208,11 +208,19 @@ def parse_yaml(path: str, text: str) -> Value:
     try:
         root = _Builder(path).build(yaml.parse(text, Loader=getattr(yaml, 'CSafeLoader', yaml.SafeLoader)))
     except yaml.YAMLError as error:
-        mark = getattr(error, 'problem_mark', None)
-        line = f' line {mark.line + 1}:' if mark else ''
-        reason = getattr(error, 'problem', None) or str(error).partition('\n')[0] or 'broken text'
-        raise InputError(f'{path}:{line} not valid YAML: {reason}') from None
+        raise InputError(f'{path}:{_problem(error, text)}') from None
     return Value(path, 1, '', '', plain=True) if root is None else root
+
+
+def _problem(error: yaml.YAMLError, text: str) -> str:
+    """Line of ``text`` that is not valid YAML, if known, and why."""
+    reason = getattr(error, 'problem', None) or str(error).partition('\n')[0] or 'broken text'
+    if (mark := getattr(error, 'problem_mark', None)) is None:
+        return f' not valid YAML: {reason}'
+    rest = dict(enumerate(text.split('\n'))).get(mark.line, '')[mark.column :]
+    if rest.startswith('\t'):
+        reason = 'a tab, where YAML takes spaces only'
+    return f' line {mark.line + 1}: not valid YAML: {reason}'
 
 
 class _Builder:

@@ -103,6 +103,9 @@ def test_what_is_left_out_has_defaults(tmp_path):
         ('markers: []', 'format'),
         (HEAD, 'no list of markers'),
         ((HEAD + ENTRY)[:-25], 'not valid YAML'),
+        # "found character that cannot start any token" said nothing of what cannot be seen.
+        (HEAD + ENTRY.replace('  -', '\t-', 1), 'line 7: not valid YAML: a tab, where YAML takes spaces only'),
+        (HEAD + '  - {', 'not valid YAML'),
         (HEAD + '  - 3\n', 'markers\\[0\\].*is not a marker'),
         (HEAD + ENTRY + ENTRY, 'markers\\[1\\].*marker 2 is there twice'),
         (HEAD + ENTRY.replace('id: 2', 'id: two'), "markers\\[0\\]: id: 'two'"),
@@ -131,6 +134,16 @@ def test_a_broken_map_is_refused_with_file_and_entry(tmp_path, text, complaint):
         load_map(path)
     assert str(path) in str(caught.value)
     assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('encoding', ['latin-1', 'utf-16'])
+def test_a_map_in_another_encoding_is_refused_with_the_line(tmp_path, encoding):
+    """A comment with an umlaut is enough: "not a text file" was said of a text."""
+    path = tmp_path / 'map.yaml'
+    path.write_text(HEAD + '# für die Halle\n' + ENTRY, encoding=encoding)
+    line = HEAD.count('\n') + 1 if encoding == 'latin-1' else 1
+    with pytest.raises(InputError, match=f'map.yaml: line {line}: no text in UTF-8'):
+        load_map(path)
 
 
 def test_a_covariance_must_be_one(tmp_path):
