@@ -14,6 +14,7 @@ from thermal_fiducial.report.interruptions import imu_silence_ns, Interruption, 
 from thermal_fiducial.report.map_error import map_accuracy
 from thermal_fiducial.report.marker_table import Tag, tags
 from thermal_fiducial.report.run_folder import Run
+from thermal_fiducial.report.truth_clock import doubt_of_clock
 
 #: Sampling interval of the NEES [ns]: errors are correlated over time, so denser samples add no evidence.
 CONSISTENCY_NS = 100_000_000
@@ -43,10 +44,12 @@ class Evaluation:
 
     @cached_property
     def doubt_of_truth(self) -> str:
-        """That the ground truth seems to have its quaternions in the order w x y z, in words; empty if it has not."""
-        e = self.fused_errors
-        if e is None or not len(e):
+        """That the ground truth seems to be in another clock, or to have w before x y z, in words; empty if not."""
+        e, truth = self.fused_errors, self.run.truth
+        if e is None or truth is None or not len(e):
             return ''
+        if doubt := doubt_of_clock(e, truth):
+            return doubt
         as_read, reordered = metrics.rms(e.attitude_deg), metrics.attitude_in_other_order(e)
         if as_read <= _TIMES_CLOSER * reordered:
             return ''

@@ -264,6 +264,31 @@ def test_truth_with_w_before_x_y_z_is_named(small_run, capsys):
     assert any(said in remark.text for remark in judge(*evaluate_run(small_run)).remarks)
 
 
+@pytest.mark.parametrize('offset_s', [-1.234, 0.15, 0.3])
+def test_truth_of_another_clock_is_named_with_what_is_to_be_added(small_run, capsys, offset_s):
+    """A tracker 0.3 s off made errors of 94 mm, and a covariance at fault, of a run that was 0.4 mm off."""
+    truth = small_run / 'truth.tum'
+    stamps, positions, quaternions = load_tum(truth)
+    # In a frame of its own as well, as trackers have.
+    turn = so3_exp(np.array([0.0, 0.0, 0.3]))
+    save_tum(truth, (stamps - round(offset_s * 1e9)).tolist(), positions @ turn.T + [5.0, 0.0, 1.0], quaternions)
+    assert main(['evaluate', str(small_run)]) == 0
+    said = capsys.readouterr().err.partition('With ')[2]
+    # In steps of a millisecond; the noise of the run, 2 mm at 0.7 m/s, moves the best one by another.
+    assert abs(float(said.partition(' s added')[0]) - offset_s) < 2.5e-3
+    assert said.endswith('mm off, after rigid alignment: its clock is not that of the IMU.\n')
+
+
+@pytest.mark.parametrize('scale', [0.0, 1e-4, 0.3, 1.0])
+def test_a_bad_run_is_not_a_truth_of_another_clock(tmp_path, scale):
+    """Whether it stands, or flies paths that are too short, or is late by as much as synchronised clocks are apart."""
+    truth = trajectory(100.0)
+    poses = truth.T_map_body.copy()
+    poses[:, :3, 3] *= scale
+    late = Trajectory(truth.stamps_ns + 4_000_000, poses)
+    assert evaluate(run_of(tmp_path, late, late, truth=truth)).doubt_of_truth == ''
+
+
 @pytest.mark.parametrize('turn_deg', [0.0, 3.0, 90.0, 120.0, 180.0])
 @pytest.mark.parametrize('axis', [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.577, 0.577, 0.577)])
 def test_a_run_with_a_wrong_attitude_is_not_a_truth_in_another_order(tmp_path, turn_deg, axis):
