@@ -86,7 +86,7 @@ def test_a_folder_that_is_no_bag(replay, tmp_path):
     (tmp_path / 'folder').mkdir()
     fails(replay(tmp_path / 'folder'), 'folder', 'neither metadata.yaml nor a file .mcap, .db3, .bag')
     (tmp_path / 'folder' / 'flight_0.mcap').touch()
-    fails(replay(tmp_path / 'folder'), 'folder', 'no metadata.yaml (ros2 bag reindex makes one)')
+    fails(replay(tmp_path / 'folder'), 'folder', 'no metadata.yaml (ros2 bag reindex makes one; or give its file ')
 
 
 @pytest.mark.parametrize('topic', [IMAGE_TOPIC, IMU_TOPIC, CAMERA_INFO_TOPIC])

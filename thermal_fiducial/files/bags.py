@@ -130,7 +130,10 @@ def parse_remaps(arguments: Iterable[str]) -> dict[str, str]:
 
 def _what_is_missing(folder: Path) -> str:
     """What keeps a folder from being a bag, with the remedy if there is one."""
-    if any(file.suffix in SINGLE_FILES for file in folder.iterdir()):
+    files = [file for file in folder.iterdir() if file.suffix in SINGLE_FILES]
+    if len(files) == 1:
+        return f'no metadata.yaml (ros2 bag reindex makes one; or give its file {files[0]})'
+    if files:
         return 'no metadata.yaml (ros2 bag reindex makes one)'
     return f'neither metadata.yaml nor a file {", ".join(SINGLE_FILES)}'
 

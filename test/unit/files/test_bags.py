@@ -186,6 +186,18 @@ def test_folder_without_metadata(tmp_path):
         read_all(tmp_path)
 
 
+def test_a_folder_without_metadata_names_the_file_that_can_be_read(tmp_path):
+    """After a loss of power, on a computer without ROS."""
+    folder = write(tmp_path / 'bag')
+    (folder / 'metadata.yaml').unlink()
+    with pytest.raises(InputError, match=r'no metadata\.yaml \(ros2 bag reindex .* or give its file .*\)') as caught:
+        read_all(folder)
+    assert read_all(str(caught.value).partition('its file ')[2].rstrip(')'))
+    (folder / 'another.db3').touch()
+    with pytest.raises(InputError, match=r'\(ros2 bag reindex makes one\)'):
+        read_all(folder)
+
+
 @pytest.mark.parametrize('text', ['', '{', 'a: 1', 'rosbag2_bagfile_information: 3', '\x00\x01'])
 def test_broken_metadata(tmp_path, text):
     folder = write(tmp_path / 'bag')
