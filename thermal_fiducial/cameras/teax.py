@@ -12,6 +12,7 @@ import numpy as np
 from thermal_fiducial.cameras.source import CapturedFrame, now_ns
 from thermal_fiducial.cameras.teax_stream import TeaxStream
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.packages import remedy
 
 _VENDOR, _PRODUCT = 0x0403, 0x6010
 _VENDOR_REQUEST, _RESET, _SET_LATENCY, _SET_BITMODE = 0x40, 0x00, 0x09, 0x0B
@@ -114,5 +115,5 @@ def _pyusb() -> Any:
     try:
         core, util = importlib.import_module('usb.core'), importlib.import_module('usb.util')
     except ImportError:
-        raise InputError('ThermalGrabber: pyusb is not installed; install the extra "cameras"') from None
+        raise InputError(f'ThermalGrabber: pyusb is not installed: {remedy("cameras")}') from None
     return type('usb', (), {'core': core, 'util': util})

@@ -10,6 +10,7 @@ from thermal_fiducial.cli.ranges import PROCESSES
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import parse_remaps
+from thermal_fiducial.files.packages import remedy
 
 
 def add_arguments(parser: Parser) -> None:
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         import distributed  # noqa: F401
     except ImportError:
-        raise InputError("needs the extra 'batch': pip install '.[batch]' in the package's folder") from None
+        raise InputError(f'needs the extra "batch": {remedy("batch")}') from None
     from thermal_fiducial.replay.many_bags import Batch, run_batch
     from thermal_fiducial.replay.session import Options
     from thermal_fiducial.replay.workers import workers

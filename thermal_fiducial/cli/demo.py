@@ -14,7 +14,7 @@ from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.ranges import FLIGHT_S
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.packages import is_installed, require_plots
+from thermal_fiducial.files.packages import is_installed, remedy, require_plots
 from thermal_fiducial.report.page import evaluate_run, Evaluation, require_packages, write_page
 from thermal_fiducial.report.tables import tables
 
@@ -69,7 +69,7 @@ def _check_packages(args: argparse.Namespace) -> None:
     require_packages(tables=True)
     missing = [name for name in ROS_PACKAGES if not is_installed(name)]
     if missing:
-        raise InputError(f'the demo runs the ROS 2 nodes and finds no {missing[0]}: install the extra "ros"')
+        raise InputError(f'the demo runs the ROS 2 nodes and finds no {missing[0]}: {remedy("ros")}')
     if args.picture is not None:
         require_plots('--picture')
         _check_picture(args.picture, args.out)

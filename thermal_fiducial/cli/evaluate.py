@@ -11,6 +11,7 @@ from thermal_fiducial.cli.arguments import file_to_write, warn
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.packages import remedy
 from thermal_fiducial.report.page import evaluate_run, require_packages, VIDEO, write_page
 from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.tables import tables
@@ -90,7 +91,7 @@ def _compare(args: argparse.Namespace) -> int:
     try:
         from thermal_fiducial.report.comparison import compare
     except ModuleNotFoundError as error:
-        raise InputError(f'--compare needs {error.name}: install the extra "tools"') from None
+        raise InputError(f'--compare needs {error.name}: {remedy("tools")}') from None
     comparison = compare(args.folders, args.truth)
     if args.json:
         print(json.dumps(comparison.numbers, indent=2))
@@ -116,7 +117,7 @@ def print_tables(shown: Iterable[Table]) -> None:
     try:
         from thermal_fiducial.cli.terminal_tables import show
     except ModuleNotFoundError as error:
-        raise InputError(f'the tables need {error.name}: install the extra "tools", or use --json') from None
+        raise InputError(f'the tables need {error.name}: {remedy("tools")}, or use --json') from None
     for entry in shown:
         for part in _parts(entry):
             show(_for_terminal(part))

@@ -10,10 +10,11 @@ import sys
 from thermal_fiducial import __version__
 from thermal_fiducial.cli.parser import add_command, Parser, PROGRAM
 from thermal_fiducial.errors import InputError, RunError
+from thermal_fiducial.files.packages import remedy
 from thermal_fiducial.files.reading import shown
 from thermal_fiducial.ros.process.interrupts import Interrupts
 
-INSTALL_HINT = "pip install '.[tools,ros]' in the package's folder, or apt on the robot"
+INSTALL_HINT = f'{remedy("tools,ros")}, or apt on the robot'
 
 #: Commands and their descriptions. Module ``cli/<command>.py`` has ``add_arguments(parser)`` and ``run(args) -> int``;
 #: it is imported only when its command is called, so that each starts fast and needs only its own packages.

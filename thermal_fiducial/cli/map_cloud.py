@@ -14,6 +14,7 @@ from thermal_fiducial.core.geometry.se3 import apply, inverse, quaternion_from_r
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.packages import remedy
 from thermal_fiducial.files.point_cloud import load_cloud, save_alignment, thinned
 from thermal_fiducial.map_tools.cloud_alignment import align_to_cloud, CloudAlignment
 from thermal_fiducial.report.metrics import rms
@@ -52,7 +53,7 @@ def _align(args: argparse.Namespace) -> int:
     try:
         alignment = align_to_cloud(marker_map.markers.values(), cloud, initial, args.reach)
     except ImportError as error:
-        raise InputError("map align needs the extra 'cloud': pip install '.[cloud]' in the package's folder") from error
+        raise InputError(f'map align needs the extra "cloud": {remedy("cloud")}') from error
     _print_result(alignment)
     if args.out:
         save_alignment(args.out, alignment.T, args.cloud.name, marker_map.frame_id)

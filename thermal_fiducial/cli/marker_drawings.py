@@ -29,7 +29,7 @@ from thermal_fiducial.fabrication.verification import agree, problems, read_dxf
 from thermal_fiducial.fabrication.writers import FORMATS, write
 from thermal_fiducial.files.dictionary import copied_beside, load_dictionary
 from thermal_fiducial.files.marker_map import save_map
-from thermal_fiducial.files.packages import is_installed
+from thermal_fiducial.files.packages import is_installed, remedy
 from thermal_fiducial.files.reading import read_text
 from thermal_fiducial.files.writing import write_text
 
@@ -253,9 +253,7 @@ def _formats(args: argparse.Namespace) -> list[str]:
     missing = [kind for kind in formats if not is_installed(FORMATS[kind])]
     if missing:
         libraries = ', '.join(FORMATS[kind] for kind in missing)
-        raise InputError(
-            f'{libraries} missing: install the extra "tools", or leave {", ".join(missing)} out of --formats'
-        )
+        raise InputError(f'{libraries} missing: {remedy("tools")}, or leave {", ".join(missing)} out of --formats')
     return formats
 
 

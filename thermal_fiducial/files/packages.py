@@ -13,6 +13,11 @@ def is_installed(package: str) -> bool:
         return False
 
 
+def remedy(extra: str) -> str:
+    """How to install the libraries of an extra of ``setup.py``."""
+    return f"pip install '.[{extra}]' in the package's folder"
+
+
 def require_plots(option: str = '--plot') -> None:
     """Check for the plotting library before the work begins.
 
@@ -22,4 +27,4 @@ def require_plots(option: str = '--plot') -> None:
         matplotlib is missing.
     """
     if not is_installed('matplotlib'):
-        raise InputError(f'{option} needs matplotlib: install the extra "tools"')
+        raise InputError(f'{option} needs matplotlib: {remedy("tools")}')

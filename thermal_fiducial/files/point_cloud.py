@@ -9,6 +9,7 @@ from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transfo
 from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.packages import remedy
 from thermal_fiducial.files.plain_yaml import save_plain
 from thermal_fiducial.files.schema import load_yaml
 
@@ -19,7 +20,7 @@ _VALUES = re.compile(rb'^COUNT((?: +-?[0-9]{1,18})+)', re.MULTILINE)
 _MOST_VALUES = 1000
 _PACKED = re.compile(rb'^DATA +binary_compressed', re.MULTILINE)
 _HEADER_BYTES = 65_536
-_NEEDED = "reading point clouds needs the extra 'cloud': pip install '.[cloud]' in the package's folder"
+_NEEDED = f'reading point clouds needs the extra "cloud": {remedy("cloud")}'
 
 
 def load_cloud(path: str | Path) -> FloatArray:

@@ -6,7 +6,7 @@ from typing import Any
 
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.packages import is_installed
+from thermal_fiducial.files.packages import is_installed, remedy
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import evaluate, Evaluation
@@ -30,7 +30,7 @@ def require_packages(*, tables: bool = False) -> None:
     needed = ('jinja2', 'plotly', *(('rich',) if tables else ()))
     missing = [name for name in needed if not is_installed(name)]
     if missing:
-        raise InputError(f'the report needs {", ".join(missing)}: install the extra "tools"')
+        raise InputError(f'the report needs {", ".join(missing)}: {remedy("tools")}')
 
 
 def evaluate_run(

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
-from thermal_fiducial.files.packages import is_installed
+from thermal_fiducial.files.packages import is_installed, remedy
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import new_file
 from thermal_fiducial.report.frames import annotated, bag_of, refuse_other_flight, views, write
@@ -29,7 +29,7 @@ _BgrPixels = npt.NDArray[np.uint8]
 def require_encoder() -> None:
     """Raise InputError if PyAV is not installed."""
     if not is_installed('av'):
-        raise InputError('--video needs PyAV: install the extra "video"')
+        raise InputError(f'--video needs PyAV: {remedy("video")}')
 
 
 def write_video(

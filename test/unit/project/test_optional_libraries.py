@@ -10,6 +10,7 @@ import pytest
 from support.run_folders import make_run
 
 import thermal_fiducial.core
+from thermal_fiducial.files.packages import remedy
 
 WITHOUT_ROS = ('rclpy', 'sensor_msgs', 'geometry_msgs', 'rosbags', 'yaml')
 TOOLS = ('matplotlib', 'jinja2', 'plotly', 'evo', 'rich', 'scipy', 'ezdxf', 'PIL')
@@ -59,7 +60,7 @@ def test_measures_need_no_tools(run_folder):
 def test_a_missing_tool_is_named_in_one_line(run_folder, options):
     result = python(COMMAND, TOOLS, 'evaluate', run_folder, *options)
     assert result.returncode == 2
-    assert 'install the extra "tools"' in result.stderr
+    assert "pip install '.[tools]' in the package's folder" in result.stderr
     assert result.stderr.count('\n') == 1
 
 
@@ -76,8 +77,8 @@ def test_a_package_that_is_there_and_broken_is_not_said_to_be_missing(run_folder
 @pytest.mark.parametrize(
     ('options', 'hidden', 'words'),
     [
-        ((), ('plotly',), 'the report needs plotly: install the extra "tools", or replay with --no-report'),
-        (('--no-report', '--video'), ('av',), '--video needs PyAV: install the extra "video"'),
+        ((), ('plotly',), f'the report needs plotly: {remedy("tools")}, or replay with --no-report'),
+        (('--no-report', '--video'), ('av',), f'--video needs PyAV: {remedy("video")}'),
     ],
 )
 def test_a_replay_names_missing_packages_before_it_begins(tmp_path, monkeypatch, options, hidden, words):
@@ -93,9 +94,9 @@ def test_a_replay_names_missing_packages_before_it_begins(tmp_path, monkeypatch,
 @pytest.mark.parametrize(
     ('hidden', 'options', 'words'),
     [
-        (('rclpy', 'sensor_msgs'), (), 'the demo runs the ROS 2 nodes and finds no rclpy: install the extra "ros"'),
-        (('matplotlib',), ('--picture', 'demo.png'), '--picture needs matplotlib: install the extra "tools"'),
-        (('plotly',), (), 'the report needs plotly: install the extra "tools"'),
+        (('rclpy', 'sensor_msgs'), (), f'the demo runs the ROS 2 nodes and finds no rclpy: {remedy("ros")}'),
+        (('matplotlib',), ('--picture', 'demo.png'), f'--picture needs matplotlib: {remedy("tools")}'),
+        (('plotly',), (), f'the report needs plotly: {remedy("tools")}'),
     ],
 )
 def test_the_demo_names_missing_packages_before_it_begins(tmp_path, hidden, options, words):
@@ -114,7 +115,7 @@ for command in {commands}:
 """
     result = python(code, ('matplotlib',), str(tmp_path / 'plot.png'))
     assert result.returncode == 0, result.stderr
-    refusal = '--plot needs matplotlib: install the extra "tools"'
+    refusal = f'--plot needs matplotlib: {remedy("tools")}'
     assert result.stderr == ''.join(f'thermal-fiducial {command.split()[0]}: {refusal}\n' for command in commands)
     assert result.stdout == ''
 
@@ -122,7 +123,7 @@ for command in {commands}:
 def test_drawings_that_cannot_all_be_written_are_not_begun(tmp_path):
     result = python(COMMAND, ('ezdxf', 'reportlab'), 'markers', 'make', '--ids', '1', '--out', str(tmp_path))
     assert result.returncode == 2
-    words = 'ezdxf, reportlab missing: install the extra "tools", or leave dxf, pdf out of --formats'
+    words = f'ezdxf, reportlab missing: {remedy("tools")}, or leave dxf, pdf out of --formats'
     assert result.stderr == f'thermal-fiducial markers: {words}\n'
     assert not list(tmp_path.iterdir())
 
