@@ -18,6 +18,7 @@ from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.images import image_to_array, PICTURE_SUFFIXES, pictures_in, stamp_to_ns
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.recordings import check_units, imu_samples
+from thermal_fiducial.files.records import camera
 
 #: Columns of a file of measured points; a header may hold more.
 POINT_COLUMNS = ('view', 'point', 'u', 'v', 'x', 'y')
@@ -114,7 +115,7 @@ def recorded_camera(bag: BagReader) -> Camera:
     bag.require({CAMERA_INFO_TOPIC: _INFO_TYPE})
     info = next(bag.messages([CAMERA_INFO_TOPIC])).message
     with naming(bag.path):
-        return Camera(int(info.width), int(info.height), np.array(info.k), str(info.distortion_model), np.array(info.d))
+        return camera(info)
 
 
 def imu_track(bag: BagReader) -> tuple[ImuTrack, int]:

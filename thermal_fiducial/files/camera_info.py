@@ -13,8 +13,6 @@ from thermal_fiducial.files.plain_yaml import save_plain
 from thermal_fiducial.files.schema import load_yaml, Value
 
 _LARGEST_SIDE = 65_535
-#: Other tools' names of the distortion models.
-MODEL_SYNONYMS = {'fisheye': 'equidistant', 'radtan': 'plumb_bob', 'radial-tangential': 'plumb_bob'}
 
 
 def load_camera(path: str | Path) -> Camera:
@@ -38,12 +36,11 @@ def load_camera(path: str | Path) -> Camera:
 
 
 def _camera(fields: dict[str, Value]) -> Camera:
-    model = fields['distortion_model'].text() if 'distortion_model' in fields else 'plumb_bob'
     return Camera(
         width=_integer(fields, 'image_width'),
         height=_integer(fields, 'image_height'),
         K=_matrix(fields, 'camera_matrix', 9).reshape(3, 3),
-        model=MODEL_SYNONYMS.get(model, model),
+        model=fields['distortion_model'].text() if 'distortion_model' in fields else 'plumb_bob',
         D=_matrix(fields, 'distortion_coefficients', None),
     )
 

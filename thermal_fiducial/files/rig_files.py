@@ -13,7 +13,6 @@ from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternio
 from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.camera_info import MODEL_SYNONYMS
 from thermal_fiducial.files.reading import read_text, shown
 from thermal_fiducial.files.schema import parse_yaml, Value
 
@@ -186,7 +185,7 @@ def _lens(entry: Value, width: int, height: int, K: FloatArray, model: str, coef
     D = fields[coefficients].items() if coefficients in fields else []
     distortion = np.array([value.number() for value in D])
     try:
-        return require_usable(Camera(width, height, K, MODEL_SYNONYMS.get(name, name), distortion))
+        return require_usable(Camera(width, height, K, name, distortion))
     except InputError as error:
         raise entry.error(str(error)) from None
 

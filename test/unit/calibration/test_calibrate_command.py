@@ -27,6 +27,7 @@ import yaml
 
 from thermal_fiducial.calibration import camera_imu
 from thermal_fiducial.calibration.camera_imu import CameraImuCalibration
+from thermal_fiducial.calibration.sources import recorded_camera
 from thermal_fiducial.calibration.targets import Chessboard
 from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.board_views import BoardViews
@@ -37,7 +38,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera, save_camera
 from thermal_fiducial.files.dictionary import load_dictionary, PACKAGED
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
@@ -150,7 +151,8 @@ def test_camera_against_imu_refuses_a_calibration_of_another_size(tmp_path, caps
 @pytest.mark.parametrize(
     ('topic', 'fields', 'words'),
     [
-        (CAMERA_INFO_TOPIC, {'k': np.zeros(9)}, 'camera matrix without a focal length'),
+        (CAMERA_INFO_TOPIC, {'k': np.zeros(9)}, 'camera_info: camera matrix without a focal length'),
+        (CAMERA_INFO_TOPIC, {'binning_x': 2}, 'camera_info of a binned or cropped image'),
         (IMAGE_TOPIC, {'encoding': 'bgr8'}, "image of encoding 'bgr8'"),
         (CAMERA_INFO_TOPIC, {'width': 320, 'height': 256}, 'image of 640x512, camera_info of 320x256'),
         # Without turn rates the adjustment has no solution.
@@ -163,6 +165,14 @@ def test_camera_against_imu_names_the_bag_of_what_it_cannot_use(tmp_path, topic,
     command = ['calibrate', 'camera-imu', str(recorded.write(tmp_path / 'bag')), '--map', str(marker_map)]
     assert main([*command, '--out', str(tmp_path / 'extrinsics.yaml')]) == 2
     assert f'{tmp_path}/bag: {words}' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('name', ['', 'radtan'])
+def test_the_camera_of_a_bag_is_read_as_the_nodes_read_it(tmp_path, name):
+    """A model without a name was refused, which a replay takes for plumb_bob."""
+    recorded = recording(seconds=0.1).changed(CAMERA_INFO_TOPIC, lambda info: replaced(info, distortion_model=name))
+    with BagReader(recorded.write(tmp_path / 'bag')) as bag:
+        assert recorded_camera(bag).matches(CAMERA)
 
 
 def _axes_of(text, name):

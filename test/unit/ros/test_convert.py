@@ -128,6 +128,14 @@ def test_cameras_come_back(model, coefficients):
     assert convert.camera(sent(convert.camera_info(camera, HEAD))).matches(camera)
 
 
+@pytest.mark.parametrize(('name', 'model'), [('fisheye', 'equidistant'), ('radtan', 'plumb_bob'), ('', 'plumb_bob')])
+def test_drivers_copy_names_of_models_from_files_of_other_tools(name, model):
+    camera = Camera(640, 512, np.array([[440.4, 0.0, 320.5], [0.0, 441.0, 255.2], [0.0, 0.0, 1.0]]), model, [0.1])
+    message = convert.camera_info(camera, HEAD)
+    message.distortion_model = name
+    assert convert.camera(message).matches(camera)
+
+
 def test_a_region_of_interest_may_be_the_whole_image():
     camera = Camera(640, 512, np.array([[440.4, 0.0, 320.5], [0.0, 441.0, 255.2], [0.0, 0.0, 1.0]]))
     message = convert.camera_info(camera, HEAD)

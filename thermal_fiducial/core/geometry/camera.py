@@ -25,6 +25,8 @@ MODELS = {
     'rational_polynomial': ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6'),
     'equidistant': ('k1', 'k2', 'k3', 'k4'),
 }
+# Other tools' names of the models, which drivers copy from their files.
+_SYNONYMS = {'fisheye': 'equidistant', 'radtan': 'plumb_bob', 'radial-tangential': 'plumb_bob'}
 # Newton's iteration doubles the digits: after a step this small nothing is left, and twelve are enough half a degree
 # from the hemisphere of a fisheye lens.
 _STEPS, _SHORT = 12, 1e-6
@@ -58,7 +60,7 @@ class Camera:
     ----------
     width, height : image size [px]
     K : (3, 3) camera matrix [px]
-    model : a key of :data:`MODELS`
+    model : a key of :data:`MODELS`, or another tool's name of it
     D : distortion coefficients in the order of camera_info
 
     Raises
@@ -76,11 +78,12 @@ class Camera:
 
     def __post_init__(self) -> None:
         K, D = _numbers('camera matrix', self.K), _numbers('distortion', [] if self.D is None else self.D).reshape(-1)
-        if self.model not in MODELS:
+        model = _SYNONYMS.get(self.model, self.model)
+        if model not in MODELS:
             raise InputError(f'distortion model {self.model!r} is not one of {", ".join(MODELS)}')
-        count = len(MODELS[self.model])
+        count = len(MODELS[model])
         if D[count:].any():
-            raise InputError(f'{self.model} takes {count} coefficients, not {len(D)}')
+            raise InputError(f'{model} takes {count} coefficients, not {len(D)}')
         if K.size != 9:
             raise InputError(f'camera matrix of shape {K.shape}, not (3, 3)')
         K = K.reshape(3, 3)
@@ -93,6 +96,7 @@ class Camera:
         filled = np.zeros(count)
         filled[: len(D)] = D[:count]
         object.__setattr__(self, 'K', K)
+        object.__setattr__(self, 'model', model)
         object.__setattr__(self, 'D', filled)
 
     @cached_property
