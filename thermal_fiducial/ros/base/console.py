@@ -1,6 +1,12 @@
 """Console lines for the pilot: printed on change, at most one of each kind a second."""
 
+import re
 from typing import Any
+
+#: Calls of :meth:`Console.say` until a headline of which only numbers have changed is printed again: an estimate moves
+#: in its last digit at almost each of them. Refusals that stay the same are printed twice a minute, too.
+CALLS_BETWEEN = 30
+_NUMBER = re.compile(r'\d+(\.\d+)?')
 
 
 class Console:
@@ -9,6 +15,8 @@ class Console:
     def __init__(self, logger: Any) -> None:
         self._logger = logger
         self._said = ''
+        #: calls since that was printed
+        self._calls = 0
         self._events: dict[str, str] = {}
 
     def event(self, kind: str, line: str) -> None:
@@ -16,12 +24,18 @@ class Console:
         self._events[kind] = line
 
     def say(self, headline: str, *, calm: bool) -> None:
-        """Print the queued events, and the ``headline`` if it has changed, also that there is none any more."""
+        """Print the queued events, and the ``headline`` if it has changed, also that there is none any more.
+
+        One of which only numbers have changed is printed :data:`CALLS_BETWEEN` calls after the last line.
+        """
         for line in self._events.values():
             self._logger.warning(line)
         self._events.clear()
-        if headline == self._said:
+        self._calls += 1
+        same_words = _NUMBER.sub('', headline) == _NUMBER.sub('', self._said)
+        if headline == self._said or (same_words and self._calls < CALLS_BETWEEN):
             return
+        self._calls = 0
         before, self._said = self._said, headline
         # Separate calls: rclpy refuses another severity from the same line of code.
         if headline and calm:
