@@ -29,6 +29,9 @@ BEHIND_STAMP = _HEADER + _STAMP.size
 _SIZES, _ROWS = struct.Struct('<III'), struct.Struct('<II')
 # Position, quaternion, pose covariance; velocity, angular velocity, twist covariance.
 _POSE, _ODOMETRY = 7 + 36, 7 + 36 + 6 + 36
+# Where the variances of the position are in these. Of a position that is known this badly [m] nothing follows for a
+# frame: a hundred times what a filter calls lost. Its velocity may be beyond all bounds by then.
+_VARIANCES, _LOST_M = [7, 14, 21], 30.0
 # Orientation, angular velocity, specific force, each with its covariance.
 _IMU = 4 + 9 + 3 + 9 + 3 + 9
 # Longest message accepted [bytes], since hundreds are kept: the numbers take 712, the rest are names of frames.
@@ -67,6 +70,8 @@ def stamp_ns(message: bytes, what: str = 'odometry', longest: int = _LONGEST) ->
 def odometry(messages: Sequence[bytes]) -> list[Odometry]:
     """States of N odometry messages: decoding N at once takes little longer than one.
 
+    Those of a filter that has been lost for long are left out: they are no fault of the message, and say nothing.
+
     Raises
     ------
     InputError
@@ -74,11 +79,15 @@ def odometry(messages: Sequence[bytes]) -> list[Odometry]:
     """
     stamps = [stamp_ns(message) for message in messages]
     numbers = np.stack([_numbers(message, 2, _ODOMETRY, 'odometry') for message in messages]).astype(np.float64)
+    covariances = np.stack([numbers[:, 7:43], numbers[:, 49:]], axis=1).reshape(-1, 2, 6, 6)
+    covariances = checked_covariance(covariances, 'odometry with a covariance')
+    known = np.flatnonzero(np.all(numbers[:, _VARIANCES] < _LOST_M**2, axis=1))
+    if not len(known):
+        return []
+    stamps, numbers, covariances = [stamps[index] for index in known], numbers[known], covariances[known]
     twists = numbers[:, 43:49]
     if not (np.abs(twists) < FASTEST).all():
         raise InputError('odometry with a twist that is not finite or beyond all bounds')
-    covariances = np.stack([numbers[:, 7:43], numbers[:, 49:]], axis=1).reshape(-1, 2, 6, 6)
-    covariances = checked_covariance(covariances, 'odometry with a covariance')
     T_map_body = convert.transform_of_values(numbers[:, :7], 'odometry')
     columns = zip(stamps, T_map_body, twists, covariances, strict=True)
     return [Odometry(stamp, T, twist[:3], twist[3:], pose, speed) for stamp, T, twist, (pose, speed) in columns]
