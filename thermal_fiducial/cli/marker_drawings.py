@@ -79,6 +79,8 @@ def add_sheet(parser: Parser) -> None:
 
 def _sheet(args: argparse.Namespace) -> int:
     width, height = args.sheet
+    if args.spacing <= args.kerf:
+        raise InputError(f'--spacing {args.spacing:g}: cuts of {args.kerf:g} mm need more between markers (--kerf)')
     dictionary, ids = chosen(args)
     drawings = _markers(dictionary, ids, args)
     _write_all(nest(drawings, width, height, spacing=args.spacing, margin=args.margin), args)
