@@ -213,7 +213,8 @@ def look_at_bag(frames: Iterable[BagFrame], views: BoardViews, most: int, every:
             if motion_px < most_motion_px:
                 views.keep(pending)
             else:
-                views.leave(pending.name, f'the board moves by {motion_px:.1f} px until the next frame', pending.counts)
+                moving = f'the board moves by {motion_px:.1f} px until the next frame (--most-motion)'
+                views.leave(pending.name, moving, pending.counts)
         pending = None
         if sighting is not None and _is_new(sighting, views.kept):
             pending = BoardView(frame.name, sighting, frame.counts)

@@ -238,6 +238,8 @@ def _views(args: argparse.Namespace) -> BoardViews:
         raise InputError(f'{args.source}: no such folder of pictures, bag or CSV file')
     with BagReader(args.source, parse_remaps(args.remap)) as bag:
         by_corners = isinstance(views.target, MarkerBoard) and has_corners_only(bag)
+        if by_corners and args.plate_thickness:
+            raise InputError(f'--plate-thickness has no effect with {args.source}, which has corners instead of images')
         frames = corners_of(bag, views) if by_corners else images_of(bag, views, args.focal_px)
         look_at_bag(frames, views, args.most_views, args.every, args.most_motion)
     return views

@@ -254,7 +254,9 @@ def test_intrinsics_from_recorded_corners(tmp_path, capsys):
     words += ['--every', '1', '--models', 'plumb_bob']
     # A flight is never at rest as a board is that is held still.
     assert main(words) == 2
-    assert re.search(r'the board moves by \d+\.\d px until the next frame', capsys.readouterr().err)
+    assert re.search(r'the board moves by \d+\.\d px until the next frame \(--most-motion\)', capsys.readouterr().err)
+    assert main([*words, '--plate-thickness', '0.003']) == 2
+    assert '--plate-thickness has no effect' in capsys.readouterr().err
     found = tmp_path / 'found.yaml'
     assert main([*words, '--most-motion', '100', '--board-out', str(found)]) == 0
     printed = capsys.readouterr()
