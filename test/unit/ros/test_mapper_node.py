@@ -140,10 +140,13 @@ def test_a_map_in_other_units_is_doubted_though_frames_allow_two_poses_or_none(g
     for k in range(30):
         rows = walls.see(walls.flight(at), poses, 0.05, rng)
         graph.send('markers', clouds.cloud(rows, convert.header(START + k * 33_333_333, 'camera')))
+    # As of a map in centimetres.
+    node.mapper.readout.adopt(ReadoutEstimate(-0.1, 0.001))
     level, reason, _ = graph.diagnose(node)
     said = 'corners are not where map and calibration have them'
     printed = capfd.readouterr().err
-    assert (said in reason, said in printed, level == WARN) == (unit > 1.0,) * 3
+    assert (said in reason, said in printed, level) == (unit > 1.0, unit > 1.0, WARN)
+    assert ('rows are read over' in reason) == (unit == 1.0 or at == 0.0)
     # Where no pose is found all of the markers contradict the map; two possible ones are undecided.
     assert ('distances in the map are 39.4 times those seen' in printed) == (unit > 1.0 and at > 0.0)
 

@@ -89,7 +89,10 @@ class CameraPoses:
 
     @property
     def doubts(self) -> str:
-        """Rolling shutters that are not as declared, of both cameras."""
+        """Rolling shutters that are not as declared, of both cameras; none by a map that is contradicted."""
+        if self._mapper.doubt_of_map:
+            # By such a map nothing is known of the time.
+            return ''
         doubts = [self._mapper.readout.doubt]
         if self._locator is not None and (doubt := self._locator.readout.doubt):
             doubts.append(f'{self._config.second_camera}: {doubt}')
