@@ -71,15 +71,19 @@ class Focus:
     @property
     def doubt(self) -> str:
         """That the lens is out of focus; empty while it is not known to be."""
-        if self.variance > (_UNKNOWN * self.blur_px) ** 2 or self.blur_px < _OUT_OF_FOCUS * self.declared_px:
+        if self._is_unknown or self.blur_px < _OUT_OF_FOCUS * self.declared_px:
             return ''
         return (
             f'images blur by {self.blur_px:.1f} px, blur_px is {self.declared_px:.2g}: focus the lens, or set blur_px'
         )
 
+    @property
+    def _is_unknown(self) -> bool:
+        return self.variance > (_UNKNOWN * self.blur_px) ** 2
+
     def due(self, stamp_ns: int) -> bool:
         """Whether a frame is to be looked at."""
-        if self.stamp_ns is None or self.variance > (_UNKNOWN * self.blur_px) ** 2:
+        if self.stamp_ns is None or self._is_unknown:
             return True
         return not 0 <= stamp_ns - self.stamp_ns < _PERIOD_S * SECOND_NS
 
@@ -108,6 +112,10 @@ def shown_blur(frame: Frame, corners: ImagePoints, motion: MotionBlur, cells: in
     motion : their blur by motion
     cells : m along a side
     """
+    still = np.hypot(motion.spread[:, 0], motion.spread[:, 1]) < _MOST_MOTION * frame.blur_px
+    if not still.any():
+        return None
+    corners, motion = corners.only(still), motion.only(still)
     motion_px = np.hypot(motion.spread[:, 0], motion.spread[:, 1])
     widest = math.hypot(frame.blur_px, motion_px.max())
     image = frame.pixels if motion.to_tails is None else frame.image
@@ -119,8 +127,7 @@ def shown_blur(frame: Frame, corners: ImagePoints, motion: MotionBlur, cells: in
     # Of optics and motion together to that of the optics: the squares add up.
     share = (blur.across / frame.blur_px).ravel()
     wider, std = share * wider, share * std
-    still = np.repeat(motion_px < _MOST_MOTION * frame.blur_px, 4 * cells)
-    shown = still & (std < _UNSURE * frame.blur_px)
+    shown = std < _UNSURE * frame.blur_px
     number = int(np.count_nonzero(shown))
     if number < _FEWEST_SEGMENTS:
         return None
