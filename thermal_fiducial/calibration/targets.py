@@ -13,8 +13,7 @@ from thermal_fiducial.calibration.placement import BoardNodes
 from thermal_fiducial.calibration.recognition import BoardNotFound, recognise
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import corners_in_map
-from thermal_fiducial.core.mapping.map_data import MarkerMap
+from thermal_fiducial.core.mapping.map_data import corners_of_markers, MarkerMap
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 from thermal_fiducial.core.wording import number_of
@@ -232,6 +231,4 @@ class MarkerBoard:
 
     def _corners(self, ids: Iterable[int]) -> FloatArray:
         """Corners (N, 4, 3) of markers as described [m]."""
-        markers = [self._markers[marker_id] for marker_id in ids]
-        T = np.stack([marker.T_map_marker for marker in markers])
-        return corners_in_map(T, np.array([marker.size for marker in markers]))
+        return corners_of_markers([self._markers[marker_id] for marker_id in ids])

@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.geometry.se3 import lever_arm, turned
-from thermal_fiducial.core.mapping.map_data import align, Alignment, MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import align, Alignment, corners_of_markers, MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.core.wording import listed
 from thermal_fiducial.errors import InputError
@@ -126,7 +125,7 @@ def _misfit(
     One common marker fits exactly: it shows no misfit, and the errors of both of its poses count.
     """
     markers = [moved[key] for key in common]
-    corners = corners_in_map(np.stack([m.T_map_marker for m in markers]), np.array([m.size for m in markers]))
+    corners = corners_of_markers(markers)
     middle = corners.mean(axis=(0, 1))
     if len(common) == 1:
         return middle, markers[0].covariance + resting.markers[common[0]].covariance

@@ -119,16 +119,29 @@ def apply(T: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
     return np.asarray(points @ T[..., :3, :3].swapaxes(-1, -2) + T[..., None, :3, 3])
 
 
-def rigid_alignment(target: npt.ArrayLike, source: npt.ArrayLike) -> FloatArray:
-    """T_target_source (4, 4) with the least squares of ``target - T source``, points (N, 3).
+def rigid_alignment(target: npt.ArrayLike, source: npt.ArrayLike, weights: npt.ArrayLike | None = None) -> FloatArray:
+    """T_target_source (..., 4, 4) with the least squares of ``target - T source``, points (N, 3).
 
     B. Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987; here by singular values.
+
+    Parameters
+    ----------
+    weights : (..., N) of the points, for as many alignments; all alike when left out
     """
-    target, source = np.asarray(target, dtype=np.float64), np.asarray(source, dtype=np.float64)
-    centre_target, centre_source = target.mean(axis=0), source.mean(axis=0)
-    U, _, Vt = np.linalg.svd((target - centre_target).T @ (source - centre_source))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return transform(R, centre_target - R @ centre_source)
+    there, here = np.asarray(target, dtype=np.float64), np.asarray(source, dtype=np.float64)
+    of_points = np.ones(len(there)) if weights is None else np.asarray(weights, dtype=np.float64)
+    shares = of_points / of_points.sum(axis=-1, keepdims=True)
+    # About the middle of all points: sums of large numbers would lose digits.
+    middle_there, middle_here = there.mean(axis=0), here.mean(axis=0)
+    there, here = there - middle_there, here - middle_here
+    centre_there, centre_here = shares @ there, shares @ here
+    products = (shares @ (there[:, :, None] * here[:, None]).reshape(-1, 9)).reshape(*shares.shape[:-1], 3, 3)
+    U, _, Vt = np.linalg.svd(products - centre_there[..., :, None] * centre_here[..., None, :])
+    # A rotation, and no reflection.
+    U[..., 2] *= np.linalg.det(U @ Vt)[..., None]
+    R = U @ Vt
+    moved = (R @ (centre_here + middle_here)[..., None])[..., 0]
+    return transform(R, centre_there + middle_there - moved)
 
 
 def rotation_from_quaternion(q_xyzw: npt.ArrayLike) -> FloatArray:

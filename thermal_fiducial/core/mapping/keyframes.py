@@ -8,9 +8,9 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import divided_prior, draws_of, information_of_followed_map, SystematicErrors
 from thermal_fiducial.core.geometry.camera import by_other_calibration, Camera
-from thermal_fiducial.core.geometry.reprojection import corners_in_map
+from thermal_fiducial.core.geometry.se3 import rigid_alignment
 from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot
-from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import corners_of_markers, MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.undeclared_readout import rates_of_rows
 from thermal_fiducial.core.measurements import CameraPose, Observations
@@ -242,23 +242,14 @@ class KeyframeStore:
         """By the markers that each keyframe sees: rigid alignments of their corners, of all keyframes at once."""
         ids = sorted(key for key in before.keys() & after.keys() if before[key].trusted)
         stamps, sees = np.array(list(self.frames), dtype=np.int64), self._sees(ids)
-        number = 4.0 * sees.sum(axis=1)
-        stamps, sees, number = stamps[number > 0.0], sees[number > 0.0], number[number > 0.0, None]
+        shown = sees.any(axis=1)
+        stamps, sees = stamps[shown], sees[shown]
         if len(stamps) == 0:
             return Displacement(stamps, np.zeros((0, 4, 4)))
-        old, new = (_corners([markers[key] for key in ids]) for markers in (before, after))
-        # Sums of large numbers would lose digits.
-        middle = old.mean(axis=(0, 1))
-        old, new = old - middle, new - middle
-        centre_old, centre_new = (sees @ corners.sum(axis=1) / number for corners in (old, new))
-        products = (sees @ (new.swapaxes(1, 2) @ old).reshape(-1, 9)).reshape(-1, 3, 3)
-        U, _, Vt = np.linalg.svd(products - number[..., None] * centre_new[:, :, None] * centre_old[:, None])
-        U[..., 2] *= np.linalg.det(U @ Vt)[:, None]
-        T = np.broadcast_to(np.eye(4), (len(stamps), 4, 4)).copy()
-        T[:, :3, :3] = U @ Vt
-        T[:, :3, 3] = centre_new + middle - (T[:, :3, :3] @ (centre_old + middle)[..., None])[..., 0]
+        new, old = (corners_of_markers([markers[key] for key in ids]) for markers in (after, before))
+        T_new_old = rigid_alignment(new.reshape(-1, 3), old.reshape(-1, 3), np.repeat(sees, 4, axis=1))
         order = np.argsort(stamps, kind='stable')
-        return Displacement(stamps[order], T[order])
+        return Displacement(stamps[order], T_new_old[order])
 
     def _sees(self, ids: Sequence[int]) -> FloatArray:
         """Which of the N markers ``ids``, ascending, each of n keyframes sees, (n, N): 1 or 0."""
@@ -324,12 +315,6 @@ class KeyframeStore:
         for stamp, key in zip(self.frames, np.rint(scaled).astype(int).tolist(), strict=True):
             cells[tuple(key)].append(stamp)
         return cells
-
-
-def _corners(markers: Sequence[MapMarker]) -> FloatArray:
-    """Corners (N, 4, 3) in the map [m]."""
-    poses, sizes = np.stack([m.T_map_marker for m in markers]), np.array([m.size for m in markers])
-    return corners_in_map(poses, sizes)
 
 
 def _where_known(rates: FloatArray, covariances: FloatArray) -> FloatArray:

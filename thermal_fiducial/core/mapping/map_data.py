@@ -1,6 +1,6 @@
 """Data of the mapper: markers and map, alignment of two maps of one place, result of a frame."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import math
 
@@ -235,7 +235,7 @@ def align(resting: Mapping[int, MapMarker], moving: Mapping[int, MapMarker]) -> 
     for key in common:
         if abs(resting[key].size - moving[key].size) > 1e-3 * resting[key].size:
             raise InputError(f'marker {key} is {resting[key].size} m in one map and {moving[key].size} m in the other')
-    target, source = (_corners([markers[key] for key in common]) for markers in (resting, moving))
+    target, source = (corners_of_markers([markers[key] for key in common]) for markers in (resting, moving))
     # Each marker alone gives a transform; the one that suits the median marker best shows who disagrees.
     single = [rigid_alignment(t, s) for t, s in zip(target, source, strict=True)]
     T = min(single, key=lambda T: float(np.median(_distances(T, target, source))))
@@ -269,6 +269,7 @@ def _distances(T: FloatArray, target: FloatArray, source: FloatArray) -> FloatAr
     return np.asarray(np.sqrt(np.mean(np.sum((apply(T, source) - target) ** 2, axis=-1), axis=-1)))
 
 
-def _corners(markers: list[MapMarker]) -> FloatArray:
+def corners_of_markers(markers: Sequence[MapMarker]) -> FloatArray:
+    """Corners (K, 4, 3) of markers in the map [m]."""
     T = np.stack([marker.T_map_marker for marker in markers])
     return corners_in_map(T, np.array([marker.size for marker in markers]))

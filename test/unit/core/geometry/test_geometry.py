@@ -147,3 +147,24 @@ def test_a_screw_about_a_point_leaves_it_where_it_is():
     small = 1e-4 * d
     # Of second order.
     np.testing.assert_allclose(se3.screwed(T, small), se3.retract(T, small), atol=1e-7)
+
+
+def test_weighted_alignments_are_those_of_the_points_that_count():
+    """Many at once, about a place far from the origin; turned, and mirrored, which no rotation undoes."""
+    rng = np.random.default_rng(4)
+    source = rng.normal([20.0, -30.0, 5.0], 1.0, (12, 3))
+    T = se3.transform(se3.so3_exp([0.3, -1.0, 2.0]), [1.0, 2.0, 3.0])
+    target = se3.apply(T, source) + 0.01 * rng.normal(size=source.shape)
+    counts = rng.random((6, 12)) < 0.5
+    counts[:, :4] = True
+    for there in (target, target * [1.0, 1.0, -1.0]):
+        found = se3.rigid_alignment(there, source, counts)
+        for some, one in zip(counts, found, strict=True):
+            # A turn that is off by rounding, 1e-15, moves a place 40 m away by 4e-14.
+            np.testing.assert_allclose(one, se3.rigid_alignment(there[some], source[some]), atol=1e-12)
+            assert np.linalg.det(one[:3, :3]) == pytest.approx(1.0, abs=1e-12)
+    # A point twice is a weight of two.
+    twice = np.concatenate([np.arange(12), [3]])
+    weights = np.where(np.arange(12) == 3, 2.0, 1.0)
+    of_two = se3.rigid_alignment(target[twice], source[twice])
+    np.testing.assert_allclose(se3.rigid_alignment(target, source, weights), of_two, atol=1e-12)
