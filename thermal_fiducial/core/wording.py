@@ -1,7 +1,10 @@
 """Numbers and lists of things in messages."""
 
 from collections.abc import Iterable
+import re
 import sys
+
+_NUMBER = re.compile(r'\d+(\.\d+)?')
 
 
 def number_of(count: int, noun: str) -> str:
@@ -20,3 +23,8 @@ def marker_names(ids: Iterable[int], most: int = sys.maxsize) -> str:
     """Markers by their IDs, as :func:`listed`: "marker 1", "markers 1, 2 and 3 more"."""
     known = list(ids)
     return f'{"marker" if len(known) == 1 else "markers"} {listed(known, most)}'
+
+
+def without_numbers(message: str) -> str:
+    """A message with N for each number: "0.6 s without a pose" and "0.8 s without a pose" say the same."""
+    return _NUMBER.sub('N', message)

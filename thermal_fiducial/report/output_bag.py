@@ -4,12 +4,12 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-import re
 from typing import Any
 
 import numpy as np
 
 from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.wording import without_numbers
 from thermal_fiducial.files.bags import BagReader, CAMERA_POSE_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.images import header_stamp_ns, stamp_to_ns
 from thermal_fiducial.files.innovations import INNOVATIONS, Innovations, innovations_of
@@ -18,8 +18,6 @@ from thermal_fiducial.files.innovations import INNOVATIONS, Innovations, innovat
 MOST_COVARIANCES = 6000
 _POSE, _DIAGNOSTICS = 'pose', 'diagnostics'
 _WITHHELD = 'withheld: '
-# "coasting: 0.6 s without a pose" and "coasting: 0.8 s without a pose" are counted as the same message.
-_NUMBER = re.compile(r'\d+(\.\d+)?')
 WARNING = 'warning'
 _LEVELS = ('ok', WARNING, 'error', 'stale')
 
@@ -143,7 +141,7 @@ def _diagnostics(arrays: Sequence[tuple[int, Any]]) -> tuple[Diagnostic, ...]:
     for time_ns, array in arrays:
         for status in array.status:
             level = status.level[0] if isinstance(status.level, (bytes, np.ndarray)) else status.level
-            key = status.name, _LEVELS[min(int(level), 3)], _NUMBER.sub('N', status.message)
+            key = status.name, _LEVELS[min(int(level), 3)], without_numbers(status.message)
             times[key].append(time_ns)
             latest[key] = status.message
     said = [Diagnostic(*key, latest[key], tuple(when)) for key, when in times.items()]

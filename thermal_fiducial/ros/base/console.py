@@ -1,12 +1,12 @@
 """Console lines for the pilot: printed on change, at most one of each kind a second."""
 
-import re
 from typing import Any
+
+from thermal_fiducial.core.wording import without_numbers
 
 #: Calls of :meth:`Console.say` until a headline of which only numbers have changed is printed again: an estimate moves
 #: in its last digit at almost each of them. Refusals that stay the same are printed twice a minute, too.
 CALLS_BETWEEN = 30
-_NUMBER = re.compile(r'\d+(\.\d+)?')
 
 
 class Console:
@@ -32,7 +32,7 @@ class Console:
             self._logger.warning(line)
         self._events.clear()
         self._calls += 1
-        same_words = _NUMBER.sub('', headline) == _NUMBER.sub('', self._said)
+        same_words = without_numbers(headline) == without_numbers(self._said)
         if headline == self._said or (same_words and self._calls < CALLS_BETWEEN):
             return
         self._calls = 0
