@@ -112,11 +112,11 @@ def shown_blur(frame: Frame, corners: ImagePoints, motion: MotionBlur, cells: in
     motion : their blur by motion
     cells : m along a side
     """
-    still = np.hypot(motion.spread[:, 0], motion.spread[:, 1]) < _MOST_MOTION * frame.blur_px
+    still = motion.spread_px < _MOST_MOTION * frame.blur_px
     if not still.any():
         return None
     corners, motion = corners.only(still), motion.only(still)
-    motion_px = np.hypot(motion.spread[:, 0], motion.spread[:, 1])
+    motion_px = motion.spread_px
     widest = math.hypot(frame.blur_px, motion_px.max())
     image = frame.pixels if motion.to_tails is None else frame.image
     sides = sides_of(corners.x, frame.camera, image.shape, cells, OF_CLEAR, widest)

@@ -165,7 +165,7 @@ def _by_patterns(
 ) -> RefinedCorners:
     """Corners of N markers by their whole patterns."""
     # Each group is sampled alike.
-    near = nearness(start.px, decoder.cells, np.hypot(frame.blur_px, np.hypot(*blur.spread.T)))
+    near = nearness(start.px, decoder.cells, np.hypot(frame.blur_px, blur.spread_px))
     refined = RefinedCorners.none()
     # At rest the model of a bent gray scale contains its ends.
     saturation = None if blur.to_tails is None else frame.saturation

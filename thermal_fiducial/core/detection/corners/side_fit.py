@@ -62,7 +62,7 @@ def too_small_for_sides(corners_px: FloatArray, cells: int, blur_px: float) -> B
 
 def too_blurred_for_sides(corners_px: FloatArray, cells: int, blur_px: float, motion: MotionBlur) -> BoolArray:
     """Which markers (N, 4, 2) have sides that are not measured by themselves, for their size or for motion blur."""
-    blurs_px = np.hypot(blur_px, np.hypot(*motion.spread.T))
+    blurs_px = np.hypot(blur_px, motion.spread_px)
     return np.asarray(widths(corners_px) < np.maximum(_NARROW * blur_px, _NARROW_IN_MOTION * blurs_px) * cells)
 
 
@@ -90,7 +90,7 @@ def refine_corners(
     reach : (N, 2, 4) how far inside and outside the sides pixels count [px]; when left out, as far as cells allow
     """
     motion = motion or MotionBlur.none(len(corners.px))
-    motion_px = np.hypot(motion.spread[:, 0], motion.spread[:, 1])
+    motion_px = motion.spread_px
     widest = math.hypot(blur_px, motion_px.max())
     sides = sides_of(corners.x, camera, image.shape, cells, columns, widest)
     blur = blur_of(sides, blur_px, motion.spread)

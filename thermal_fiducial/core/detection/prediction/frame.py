@@ -281,6 +281,11 @@ class MotionBlur(Stacked):
     lag: FloatArray
 
     @property
+    def spread_px(self) -> FloatArray:
+        """Standard deviation (N,) of the remaining motion blur [px]."""
+        return np.hypot(self.spread[:, 0], self.spread[:, 1])
+
+    @property
     def rolling(self) -> FloatArray:
         """Displacement (N, 4, 2) of the corners by the rolling shutter alone [px]."""
         return self.shift - self.lag + self.removed
