@@ -58,7 +58,7 @@ def _make(args: argparse.Namespace) -> int:
     dictionary, ids = chosen(args)
     drawings = _markers(dictionary, ids, args)
     _write_all(drawings, args)
-    _say_what_is_weak(drawings, args, _cells(dictionary))
+    _say_what_is_weak(drawings, args, dictionary.cells)
     name_mirror_images(dictionary, ids)
     _say_parameters(args)
     return 0
@@ -84,7 +84,7 @@ def _sheet(args: argparse.Namespace) -> int:
     dictionary, ids = chosen(args)
     drawings = _markers(dictionary, ids, args)
     _write_all(nest(drawings, width, height, spacing=args.spacing, margin=args.margin), args)
-    _say_what_is_weak(drawings, args, _cells(dictionary))
+    _say_what_is_weak(drawings, args, dictionary.cells)
     name_mirror_images(dictionary, ids)
     _say_parameters(args)
     return 0
@@ -132,12 +132,12 @@ def _board(args: argparse.Namespace) -> int:
         raise InputError(f'a board of {columns} x {rows} markers: {possible}')
     labels = [str(index) for index in range(columns * rows)]
     centres = marker_grid(columns, rows, options.size, 40.0 if args.spacing is None else args.spacing)
-    base = base_plate(centres, labels, _cells(dictionary), options)
+    base = base_plate(centres, labels, dictionary.cells, options)
     board = args.out / 'board.yaml'
     markers = _markers(dictionary, range(columns * rows), args)
     copy = copied_beside(args.dictionary, args.out)
     _write_all([*markers, base], args, [board, *filter(None, [copy])])
-    _say_what_is_weak(markers, args, _cells(dictionary))
+    _say_what_is_weak(markers, args, dictionary.cells)
     if copy is not None:
         write_text(copy, read_text(args.dictionary))
     save_map(board, _board_map(centres, options, Path(args.dictionary).name))
@@ -203,11 +203,6 @@ def _add_output(parser: Parser) -> None:
     )
     add_force(parser)
     parser.refuse(['--paper'], 'without pdf among --formats', lambda args: 'pdf' not in args.formats.split(','))
-
-
-def _cells(dictionary: Dictionary) -> int:
-    """Cells along a side of its markers, border included."""
-    return int(dictionary.bits.shape[1]) + 2
 
 
 def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cells: int) -> None:

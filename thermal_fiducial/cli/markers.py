@@ -53,7 +53,6 @@ def _check(args: argparse.Namespace) -> int:
     dictionary, ids = chosen(args)
     bits = dictionary.bits
     options = marker_drawings.plate_options(args)
-    cells = bits.shape[1] + 2
     table = table_of(
         '', ('ID', 'one piece', 'islands', 'point contacts', 'narrowest web mm', 'of', 'longest arm cells'), left=['of']
     )
@@ -62,7 +61,7 @@ def _check(args: argparse.Namespace) -> int:
         for done, marker_id in enumerate(ids, 1):
             found = examine(bits[marker_id])
             drawing = marker_drawing(bits[marker_id], str(marker_id), options)
-            strength = strength_of(drawing, options, cells, args.min_web)
+            strength = strength_of(drawing, options, dictionary.cells, args.min_web)
             against.update(strength.complaints)
             good += found.cuttable and not strength.complaints
             row = found.islands, found.point_contacts, f'{strength.web_mm:.1f}', strength.kind
@@ -101,7 +100,7 @@ def _bridge(args: argparse.Namespace) -> int:
     options = PlateOptions(size=args.size, bridge_width=args.bridge_width)
     dictionary, ids = chosen(args)
     bits = dictionary.bits
-    cell = options.size / (bits.shape[1] + 2)
+    cell = options.size / dictionary.cells
     table = table_of('', ('ID', 'patches', 'webs', 'longest web cells', 'read part of a white cell covered'))
     for marker_id in ids:
         bridges = find_bridges(bits[marker_id])

@@ -218,6 +218,12 @@ def _differing(bits: Gray, others: Gray) -> Float32Array:
     return np.asarray(0.5 * (signs.shape[1] - signs @ of_others.T), dtype=np.float32)
 
 
+def _least_differing(bits: Gray, others: Gray) -> Float32Array:
+    """The least :func:`_differing` (A, B) of all rotations of the ``others``."""
+    turned = [_differing(bits, np.rot90(others, turns, axes=(1, 2))) for turns in range(4)]
+    return np.asarray(np.min(turned, axis=0), dtype=np.float32)
+
+
 def negatives(bits: Gray, closer_than: int) -> list[tuple[int, int, int]]:
     """Pairs of markers, and the distance of one from the negative of the other: the least over the rotations.
 
@@ -226,7 +232,7 @@ def negatives(bits: Gray, closer_than: int) -> list[tuple[int, int, int]]:
     bits : (M, n, n)
     closer_than : only pairs that differ in fewer bits
     """
-    differing = np.min([_differing(bits, np.rot90(1 - bits, turns, axes=(1, 2))) for turns in range(4)], axis=0)
+    differing = _least_differing(bits, 1 - bits)
     pairs = np.argwhere(np.triu(differing < closer_than))
     return [(int(a), int(b), int(differing[a, b])) for a, b in pairs]
 
@@ -239,6 +245,5 @@ def mirror_images(bits: Gray, correctable: int) -> list[tuple[int, int]]:
     bits : (M, n, n)
     correctable : wrong bits that still name a marker
     """
-    mirrored = bits[:, :, ::-1]
-    differing = np.min([_differing(mirrored, np.rot90(bits, turns, axes=(1, 2))) for turns in range(4)], axis=0)
-    return [(int(a), int(b)) for a, b in np.argwhere(np.triu(differing <= correctable))]
+    pairs = np.argwhere(np.triu(_least_differing(bits[:, :, ::-1], bits) <= correctable))
+    return [(int(a), int(b)) for a, b in pairs]

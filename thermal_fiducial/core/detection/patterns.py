@@ -46,6 +46,11 @@ class Dictionary:
     #: bit errors that still name a marker
     correctable: int
 
+    @property
+    def cells(self) -> int:
+        """Cells along a side of a marker, the black border included."""
+        return int(self.bits.shape[1]) + 2
+
 
 def correctable_bits(bits: Gray) -> int:
     """Number of wrong bits that still leave the nearest of the markers (M, n, n), in any turn, certain.
