@@ -62,11 +62,13 @@ class JointFit:
         """Weights (N,) of the markers ``by_map`` (N,) and by their errors."""
         return np.asarray(by_map * marker_weights(reprojection.errors_px, self.sight.noise_px, self.errors))
 
-    def refined(self, T_map_camera: FloatArray, reprojection: Reprojected, weights: FloatArray) -> Location | None:
+    def refined(
+        self, T_map_camera: FloatArray, reprojection: Reprojected, weights: FloatArray, noise: float | None = None
+    ) -> Location | None:
         """Gauss-Newton steps from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
 
         The linearisation of the last step, in corners, map and scale, gives the covariances. None if the markers do not
-        determine the pose.
+        determine the pose. The variance of the corners is scaled up by ``noise``; None: to the residuals.
         """
         n = len(weights)
         for remaining in reversed(range(_MOST_STEPS)):
@@ -88,7 +90,8 @@ class JointFit:
             if remaining > 0:
                 T_map_camera, reprojection = moved, there
         after = replace(reprojection, residuals=reprojection.residuals - (J @ step).reshape(n, 4, 2))
-        return self._location(T_map_camera, step, gains, chi2, after, weights)
+        noise = noise_factor(chi2, 8 * n - 6) if noise is None else noise
+        return self._location(T_map_camera, step, gains, noise, after, weights)
 
     def _weighted(self, reprojection: Reprojected, weights: FloatArray) -> tuple[FloatArray, float]:
         """The Jacobian (8 N, 6) times the robust information of the corners, and chi square of their residuals."""
@@ -104,24 +107,23 @@ class JointFit:
         T_map_camera: FloatArray,
         step: FloatArray,
         gains: FloatArray,
-        chi2: float,
+        noise: float,
         reprojection: Reprojected,
         weights: FloatArray,
     ) -> Location | None:
         """The pose (4, 4) corrected by ``step`` (6,), with its covariance; None if that is not finite.
 
-        The covariance is the sum of white corner noise, scaled up to the residuals, of errors of the map's markers, and
+        The covariance is the sum of white corner noise, scaled up by ``noise``, of errors of the map's markers, and
         of systematic errors of corners and scale by the error model.
 
         Parameters
         ----------
         gains : (6, 8 N) derivative of the pose by the corners' coordinates [1/px]
-        chi2 : of the residuals
         """
         n, sight, errors = len(weights), self.sight, self.errors
         by_corner = np.swapaxes(gains.reshape(6, 4 * n, 2), 0, 1)
         white = independent_sum(by_corner, sight.observed.covariances.reshape(-1, 2, 2))
-        white *= noise_factor(chi2, 8 * n - 6)
+        white *= noise
         lens = LensErrors(sight.observed.corners, self.camera, errors)
         arms = sight.points - sight.T_map_marker[:, None, :3, 3]
         grown = gains @ (reprojection.J_marker.reshape(n, 4, 2, 6)[..., :3] @ arms[..., None]).ravel()
@@ -140,7 +142,7 @@ class JointFit:
         ids, rms_px = tuple(sight.observed.ids.tolist()), math.sqrt(reprojection.errors_px @ reprojection.errors_px / n)
         T = retract(T_map_camera, step)
         pose = CameraPose(self.stamp_ns, T, covariance, map_covariance, ids, rms_px)
-        return Location(pose, sight, reprojection, weights, map_gains, lens, white, of_sides, by_corner)
+        return Location(pose, sight, reprojection, weights, map_gains, lens, noise, white, of_sides, by_corner)
 
     def decisive_weights(self, found: Location) -> FloatArray:
         """Weights (N,) of the markers against odometry: with the bias of corners, and residuals above their claims."""
@@ -200,7 +202,8 @@ class JointFit:
         gains = (axes[:, shown] / values[shown]) @ axes[:, shown].T @ weighted.T
         step = gains @ reprojection.residuals.ravel()
         after = replace(reprojection, residuals=reprojection.residuals - (J @ step).reshape(-1, 4, 2))
-        location = self._location(T_map_camera, np.zeros(6), gains, chi2, after, weights)
+        noise = noise_factor(chi2, 8 * len(weights) - 6)
+        location = self._location(T_map_camera, np.zeros(6), gains, noise, after, weights)
         if location is None:
             return None
         unknown = NOTHING_KNOWN**2 * axes[:, ~shown] @ axes[:, ~shown].T

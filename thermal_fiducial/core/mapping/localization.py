@@ -128,7 +128,7 @@ def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPo
     gravity and follows both over time, finds the two in it.
     """
     T = other.T_map_camera
-    second = frame.refined(T, frame.sight.reprojected(frame.camera, T), found.weights)
+    second = frame.refined(T, frame.sight.reprojected(frame.camera, T), found.weights, found.noise_factor)
     # One that hardly fits at all ends anywhere.
     if second is None or second.rotation_std > _MEANINGLESS:
         return found
@@ -149,14 +149,12 @@ def _mean(likelier: Location, less_likely: Location) -> CameraPose:
     """The pose halfway along the screw from one of two possible poses to the other, with both in its covariance.
 
     Errors across the line of sight have opposite signs in the two, so the mean of both covariances has none of their
-    correlations with the others. That of the less likely one is scaled to the other: it has more than noise in its
-    residuals.
+    correlations with the others.
     """
     T_other = less_likely.pose.T_map_camera
     mean = likelier.moved(0.5 * screw_difference(T_other, likelier.pose.T_map_camera), np.zeros((6, 6))).pose
-    scale = (likelier.rotation_std / less_likely.rotation_std) ** 2
     first, other = (pose.covariance - pose.map_covariance for pose in (likelier.pose, less_likely.pose))
-    at_own = replace(mean, covariance=0.5 * (first + scale * other) + mean.map_covariance)
+    at_own = replace(mean, covariance=0.5 * (first + other) + mean.map_covariance)
     return mean_of_two(at_own, screw_difference(T_other, mean.T_map_camera), likelier.pose)
 
 

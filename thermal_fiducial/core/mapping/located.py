@@ -108,6 +108,8 @@ class Location:
     map_gains: FloatArray
     #: errors of the lens at the corners (N, 4)
     lens: LensErrors
+    #: by which the variance of the corners is scaled up
+    noise_factor: float
     #: (6, 6) part of the covariance by noise of the corners, and (6,) the error by one standard deviation of the sides
     noise: FloatArray
     of_sides: FloatArray
