@@ -231,13 +231,13 @@ def difference(T: npt.ArrayLike, T_reference: npt.ArrayLike) -> FloatArray:
 
 
 def screwed(T: FloatArray, d: FloatArray) -> FloatArray:
-    """Pose (4, 4) moved by ``d`` (6,) along a screw: as by :func:`retract` to first order, but about a point it orbits.
+    """Pose (..., 4, 4) moved by ``d`` (..., 6) along a screw: as by :func:`retract` to first order, but about an axis.
 
     The exponential of SE(3), in these coordinates.
     """
     moved = T.copy()
-    moved[:3, :3] = so3_exp(d[3:]) @ T[:3, :3]
-    moved[:3, 3] += so3_left_jacobian(d[3:]) @ d[:3]
+    moved[..., :3, :3] = so3_exp(d[..., 3:]) @ T[..., :3, :3]
+    moved[..., :3, 3] += np.linalg.solve(so3_left_jacobian_inverse(d[..., 3:]), d[..., :3, None])[..., 0]
     return moved
 
 

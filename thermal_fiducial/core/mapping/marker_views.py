@@ -20,8 +20,9 @@ from thermal_fiducial.core.error_model import (
 from thermal_fiducial.core.geometry.camera import by_other_calibration, Camera
 from thermal_fiducial.core.geometry.reprojection import linearise, marker_corners
 from thermal_fiducial.core.geometry.rigid_fit import minimise, Quadratic, SINGULAR
+from thermal_fiducial.core.geometry.se3 import rotation_angle, screwed
 from thermal_fiducial.core.lens_errors import LensErrors
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
 #: Of a camera pose that no error of the sides has moved.
 NOT_MOVED: FloatArray = np.zeros(6)
@@ -33,6 +34,10 @@ _STEEPEST = 1e6
 _WIDEST = 1e12
 # How often a fit may change its mind about the cameras' poses.
 _CHOICES = 4
+# How many standard deviations of a camera's pose the likeliest one may be away.
+_FARTHEST = 6.0
+# Fits that come as near to each other as this [rad], by the same cameras, go on as one.
+_SAME_FIT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -117,11 +122,14 @@ class FittedPoses:
 
     #: (S, 4, 4)
     T: FloatArray
-    #: (S,) of the residuals, and minus twice the logarithm of the likelihood: comparable whatever their covariances are
+    #: (S,) of the residuals, and with those of the cameras' own poses: minus twice the logarithm of the likelihood
     chi2: FloatArray
     cost: FloatArray
-    #: of the best one (n,) which of each camera's two poses was used, and (n, 8, 8) by which residuals became white
+    #: of the best one (n,) which of each camera's two poses was used
     chosen: IntArray
+    #: and, as its weights have them: (n, 4, 4), (n, 8) [px], (n, 8, 8)
+    T_map_camera: FloatArray
+    displaced: FloatArray
     W: FloatArray
 
 
@@ -129,12 +137,17 @@ class FittedPoses:
 class _Weights:
     """Weights of n views of S markers, as decided from where the markers and their cameras were taken to be."""
 
+    #: (S, n, 4, 4) where each camera was likeliest
+    T_map_camera: FloatArray
+    #: (S, n, 8) part of the residuals by the displacement of each camera to there [px]
+    displaced: FloatArray
     #: (S, n, 8, 8) by which residuals become unit white
     W: FloatArray
-    #: (S, n) part of the costs beside the residuals': log-determinants of their covariances, chi squares of the cameras
-    constants: FloatArray
-    #: (S, n) minus twice the logarithm of each view's likelihood there
+    #: (S, n) chi square of each camera's own pose, and with that of the view's residuals; infinite if that cannot be
+    of_cameras: FloatArray
     costs: FloatArray
+    #: (S, n, 6) displacement of each camera from the pose that is known to where it is likeliest now
+    likeliest: FloatArray
 
 
 class MarkerViews:
@@ -152,10 +165,12 @@ class MarkerViews:
         self._camera_noise = np.stack([view.viewpoint.covariances for view in views])
         self._of_sides = np.stack([view.viewpoint.of_sides for view in views])
         self._draws = np.stack([view.viewpoint.draws for view in views])
-        # Views whose cameras have a larger error in common than others count less.
-        best = np.argmin(np.sum(np.square(self._draws[:, 0]), axis=(1, 2)))
-        self._covariances = self._camera_noise + covariance_by_draws(self._draws - self._draws[best, 0])
-        self._doubtful = any(len(view.viewpoint.poses) > 1 for view in views)
+        # Views whose cameras have a larger error in common than the best one's count less: (2, n, 2, 6, 6), by which of
+        # its two poses the best one has, as one error displaces each of the two otherwise.
+        self._best = int(np.argmin(np.sum(np.square(self._draws), axis=(1, 2, 3))))
+        best = self._draws[self._best, :, None, None]
+        self._covariances = self._camera_noise + covariance_by_draws(self._draws - best)
+        self._poses = max(len(view.viewpoint.poses) for view in views)
         self._chi2_of_cameras = np.stack([view.viewpoint.chi2 for view in views])
 
     def fit(self, starts: FloatArray) -> FittedPoses:
@@ -163,17 +178,27 @@ class MarkerViews:
 
         At least twice: with weights from a start some degrees off, a camera's turn that nothing shows counts in part.
         """
-        T, chosen = starts, self._choose(starts)
+        T, chosen, moved = starts, *self._choose_all(starts)
         for attempt in range(_CHOICES):
-            begun = self._weights(T, chosen)
-            T, chi2 = self._minimised(T, chosen, begun)
-            used, chosen = chosen, self._choose(T)
+            kept = _distinct(T, chosen)
+            T, used, moved = T[kept], chosen[kept], moved[:, kept]
+            begun = self._weights(T, used, used[:, [self._best]], _of(used, moved))
+            T, chi2 = self._minimised(T, begun)
+            chosen, moved, _ = self._choose(T, used[:, [self._best]], moved)
             if attempt and np.array_equal(used, chosen):
                 break
-        cost = chi2 + np.sum(begun.constants, axis=-1)
+        cost = chi2 + np.sum(begun.of_cameras, axis=-1)
         order = np.argsort(cost, kind='stable')
         best = order[0]
-        return FittedPoses(T[order], chi2[order], cost[order], used[best], begun.W[best])
+        return FittedPoses(
+            T[order],
+            chi2[order],
+            cost[order],
+            used[best],
+            begun.T_map_camera[best],
+            begun.displaced[best],
+            begun.W[best],
+        )
 
     def errors(self, fits: FittedPoses, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error but for the sides.
@@ -216,19 +241,36 @@ class MarkerViews:
         variance = noise / information + 2.0 * self._side_std**2
         return (shown / information) ** 2 / variance
 
-    def _choose(self, T: FloatArray) -> IntArray:
-        """The likelier of the two camera poses of each view, (S, n), for a marker at T."""
-        first = np.zeros((len(T), len(self._corners)), dtype=np.int64)
-        if not self._doubtful:
-            return first
-        costs = [self._weights(T, choice).costs for choice in (first, first + 1)]
-        return np.asarray(np.argmin(np.where(np.isfinite(costs), costs, np.inf), axis=0))
+    def _choose_all(self, T: FloatArray) -> tuple[IntArray, FloatArray]:
+        """As :meth:`_choose`, for the likelier pose of the best camera too."""
+        moved = np.zeros((self._poses, len(T), len(self._corners), 6))
+        choices = [self._choose(T, np.full((len(T), 1), k), moved) for k in range(self._poses)]
+        of_each = np.argmin([costs for *_, costs in choices], axis=0), np.arange(len(T))
+        chosen, moved = np.stack([each[0] for each in choices]), np.stack([each[1] for each in choices], axis=1)
+        return chosen[of_each], moved[:, *of_each]
+
+    def _choose(self, T: FloatArray, of_best: IntArray, moved: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """The likelier of P poses of each camera for a marker at T, beside that ``of_best`` (S, 1) of the best camera.
+
+        Parameters
+        ----------
+        moved : (P, S, n, 6) displacement of each pose to where it is likeliest, as known so far
+
+        Returns
+        -------
+        Which one, (S, n), the displacements as known now, and the costs (S,).
+        """
+        poses = np.arange(len(moved))[:, None, None] + np.zeros(moved.shape[1:3], dtype=np.int64)
+        weights = [self._weights(T, chosen, of_best, own) for chosen, own in zip(poses, moved, strict=True)]
+        costs = np.stack([each.costs for each in weights])
+        excluded = (poses != of_best) & (np.arange(poses.shape[-1]) == self._best)
+        costs = np.where(np.isfinite(costs) & ~excluded, costs, np.inf)
+        return np.argmin(costs, axis=0), np.stack([each.likeliest for each in weights]), costs.min(axis=0).sum(axis=-1)
 
     def _at_best(self, fits: FittedPoses) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of the best fit: residuals (n, 8) [px], and derivatives (n, 8, 6) by the cameras and by the marker."""
-        T_map_camera = self._T_map_camera[np.arange(len(fits.chosen)), fits.chosen]
-        r, J_camera, J_marker = self._linearised(fits.T[:1], T_map_camera[None])
-        return r[0], J_camera[0], J_marker[0]
+        r, J_camera, J_marker = self._linearised(fits.T[:1], fits.T_map_camera[None])
+        return r[0] + fits.displaced, J_camera[0], J_marker[0]
 
     def _linearised(self, T: FloatArray, T_map_camera: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Residuals (S, n, 8) [px] of markers at T, and derivatives (S, n, 8, 6) by the cameras and by the marker."""
@@ -238,36 +280,68 @@ class MarkerViews:
         uv, J_camera, J_marker = linearise(self._camera, T_map_camera.reshape(-1, 4, 4), T_map_marker, sizes)
         return self._corners - uv.reshape(shape), J_camera.reshape(*shape, 6), J_marker.reshape(*shape, 6)
 
-    def _weights(self, T: FloatArray, chosen: IntArray) -> _Weights:
-        """Weights of the views of markers at T (S, 4, 4) from the chosen (S, n) of each camera's poses.
+    def _weights(self, T: FloatArray, chosen: IntArray, of_best: IntArray, moved: FloatArray) -> _Weights:
+        """Weights of the views of markers at T (S, 4, 4) from the chosen (S, n) and (S, 1) of the cameras' poses.
 
         A residual comes of the corners' noise, of the systematic part, and of the camera's own pose, which moves all
-        four corners together. What cannot be, a corner in the plane of the camera, has an infinite determinant.
+        four corners together, along an arc if it is turned. So it is linearised about the likeliest pose of the camera
+        by its view, which is ``moved`` (S, n, 6) from the one that is known (B. Bell, F. Cathey, IEEE TAC 1993): a turn
+        by 10 degrees about a marker 10 m away is 0.15 m off to first order.
         """
         own = np.arange(chosen.shape[1]), chosen
-        r, J_camera, _ = self._linearised(T, self._T_map_camera[own])
-        possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(-1, -2))
-        J_sound = np.where(possible[..., None, None], J_camera, 0.0)
-        moved = J_sound @ self._covariances[own] @ np.swapaxes(J_sound, -1, -2)
-        possible &= np.all(np.einsum('...ii->...i', moved) < _WIDEST, axis=-1)
-        L = np.linalg.cholesky(np.where(possible[..., None, None], moved, 0.0) + self._uncertain)
-        log_determinants = 2.0 * np.sum(np.log(np.einsum('...ii->...i', L)), axis=-1)
-        constants = np.where(possible, log_determinants, np.inf) + self._chi2_of_cameras[own]
-        W = np.linalg.inv(L)
-        r = W @ r[..., None]
-        return _Weights(W, constants, np.sum(r * r, axis=(-1, -2)) + constants)
+        covariances = self._covariances[of_best, *own]
+        T_map_camera = screwed(self._T_map_camera[own], moved)
+        r, J_camera, _ = self._linearised(T, T_map_camera)
+        J_camera, by_camera, possible = _by_cameras(J_camera, covariances)
+        displaced = (J_camera @ moved[..., None])[..., 0]
+        W = np.linalg.inv(np.linalg.cholesky(by_camera + self._uncertain))
+        white = W @ (r + displaced)[..., None]
+        pulls = np.swapaxes(W, -1, -2) @ white
+        sigmas = np.sqrt(np.maximum(np.swapaxes(pulls, -1, -2) @ by_camera @ pulls, TINY))[..., 0]
+        likeliest = (covariances @ np.swapaxes(J_camera, -1, -2) @ pulls)[..., 0] * np.minimum(1.0, _FARTHEST / sigmas)
+        of_cameras = np.where(possible, self._chi2_of_cameras[own], np.inf)
+        costs = np.sum(white * white, axis=(-1, -2)) + of_cameras
+        return _Weights(T_map_camera, displaced, W, of_cameras, costs, likeliest)
 
-    def _minimised(self, T: FloatArray, chosen: IntArray, begun: _Weights) -> tuple[FloatArray, FloatArray]:
+    def _minimised(self, T: FloatArray, begun: _Weights) -> tuple[FloatArray, FloatArray]:
         """Poses (S, 4, 4) from starts, and their chi squares (S,), inf where there is none."""
-        T_map_camera = self._T_map_camera[np.arange(chosen.shape[1]), chosen]
 
         def evaluated(T: FloatArray) -> Quadratic:
-            r, _, J = self._linearised(T, T_map_camera)
-            r, J = (begun.W @ r[..., None]).reshape(len(T), -1, 1), (begun.W @ J).reshape(len(T), -1, 6)
+            r, _, J = self._linearised(T, begun.T_map_camera)
+            r, J = begun.W @ (r + begun.displaced)[..., None], begun.W @ J
+            r, J = r.reshape(len(T), -1, 1), J.reshape(len(T), -1, 6)
             J_transposed, chi2 = np.swapaxes(J, -1, -2), np.sum(r * r, axis=(1, 2))
             # Residuals are measured minus predicted: the gradient is that of their squares.
             return np.where(np.isfinite(chi2), chi2, np.inf), -(J_transposed @ r)[..., 0], J_transposed @ J
 
-        possible = np.all(np.isfinite(begun.constants), axis=-1)
+        possible = np.all(np.isfinite(begun.of_cameras), axis=-1)
         T, chi2, _ = minimise(T, evaluated, alternatives=len(T))
         return T, np.where(possible, chi2, np.inf)
+
+
+def _by_cameras(J_camera: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """What corners are displaced by with their cameras, which are known to ``covariances`` (S, n, 6, 6).
+
+    Returns
+    -------
+    J_camera (S, n, 8, 6) and covariances (S, n, 8, 8) [px^2], zero where a corner is hardly before the camera, and
+    which (S, n) are not.
+    """
+    possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(-1, -2))
+    J_sound = np.where(possible[..., None, None], J_camera, 0.0)
+    moved = J_sound @ covariances @ np.swapaxes(J_sound, -1, -2)
+    possible &= np.all(np.einsum('...ii->...i', moved) < _WIDEST, axis=-1)
+    sound = possible[..., None, None]
+    return np.where(sound, J_sound, 0.0), np.where(sound, moved, 0.0), possible
+
+
+def _of(chosen: IntArray, moved: FloatArray) -> FloatArray:
+    """The displacements (S, n, 6) of the ``chosen`` (S, n) ones of P poses, (P, S, n, 6)."""
+    return np.asarray(np.take_along_axis(moved, chosen[None, ..., None], axis=0)[0])
+
+
+def _distinct(T: FloatArray, chosen: IntArray) -> BoolArray:
+    """Which (S,) of poses (S, 4, 4) with the ``chosen`` (S, n) poses of cameras are not nearly one before them."""
+    turns = rotation_angle(np.swapaxes(T[:, None, :3, :3], -1, -2) @ T[:, :3, :3])
+    alike = (turns < _SAME_FIT) & np.all(chosen[:, None] == chosen, axis=-1)
+    return np.asarray(np.argmax(alike, axis=1) == np.arange(len(T)))
