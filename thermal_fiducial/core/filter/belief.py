@@ -15,7 +15,8 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
-from thermal_fiducial.core.filter.state import Estimate, POSITION
+from thermal_fiducial.core.filter.state import Estimate, POSITION, ROTATION
+from thermal_fiducial.core.geometry.se3 import so3_log
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.two_poses import DECISIVE
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
@@ -116,6 +117,15 @@ class Hypothesis(NamedTuple):
         own = replace(self.estimate.pose_noise, variances=noise.variances, information=noise.information)
         return self._replace(estimate=replace(self.estimate, pose_noise=own))
 
+    def is_apart_from(self, other: 'Hypothesis') -> bool:
+        """Whether the attitudes of the two still differ by more than is not known of this one's.
+
+        A pose may be vague enough to bring both to the same estimate before it shows which one was wrong.
+        """
+        turn = so3_log(self.estimate.state.R_map_body.T @ other.estimate.state.R_map_body)
+        variance = turn @ self.estimate.covariance[ROTATION, ROTATION] @ turn
+        return float(turn @ turn) ** 2 >= float(variance)
+
     @property
     def in_doubt(self) -> bool:
         """Whether the latest poses were refused, ``REFUSALS_OF_DOUBT`` or more in a row."""
@@ -167,7 +177,8 @@ class Belief(NamedTuple):
             return self
         if self.second:
             likelier, less_likely = sorted((other, self.second), key=attrgetter('cost'))
-            if not likelier.failed and less_likely.cost - likelier.cost <= DECISIVE:
+            undecided = less_likely.cost - likelier.cost <= DECISIVE and likelier.is_apart_from(less_likely)
+            if undecided and not likelier.failed:
                 return self
             return self._replace(alternative=likelier, second=None).settled(config)
         if other.failed or (main and main.accepted_in_row >= _REFUTED):

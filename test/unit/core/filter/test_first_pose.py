@@ -31,16 +31,19 @@ def about_marker(axis, angle):
     return transform(R, MARKER - R @ MARKER)
 
 
-def either(stamp_ns, T_map_body, axis, angle):
+def by_marker(stamp_ns, T_map_camera, turn_std):
+    """A camera pose whose turn about the marker the corners know to ``turn_std`` [rad]."""
+    at_marker = np.diag(np.repeat((0.003, turn_std), 3) ** 2)
+    to_camera, to_map = lever_arm(T_map_camera[:3, 3] - MARKER), lever_arm(T_map_camera[:3, 3])
+    of_map = to_map @ np.diag(np.repeat((1e-3, 1e-4), 3) ** 2) @ to_map.T
+    return CameraPose(stamp_ns, T_map_camera, to_camera @ at_marker @ to_camera.T + of_map, of_map)
+
+
+def either(stamp_ns, T_map_body, axis, angle, turn_std=0.02):
     """What the mapper publishes where the pose turned about the marker is possible, too: corners know each to 1 deg."""
     T = about_marker(axis, 0.5 * angle) @ T_map_body @ T_BODY_CAMERA
-    half = screw_difference(T_map_body @ T_BODY_CAMERA, T)
-    at_marker = np.diag(np.repeat((0.003, 0.02), 3) ** 2)
-    to_camera = lever_arm(T[:3, 3] - MARKER)
-    of_map = lever_arm(T[:3, 3]) @ np.diag(np.repeat((1e-3, 1e-4), 3) ** 2) @ lever_arm(T[:3, 3]).T
-    own = to_camera @ at_marker @ to_camera.T
-    mean = CameraPose(stamp_ns, T, own + of_map, of_map)
-    return mean_of_two(mean, half, mean)
+    mean = by_marker(stamp_ns, T, turn_std)
+    return mean_of_two(mean, screw_difference(T_map_body @ T_BODY_CAMERA, T), mean)
 
 
 def flown(axis, angle, speed=0.0, seconds=1.5):
@@ -132,3 +135,16 @@ def test_motion_around_the_marker_shows_which_heading_is_right(angle):
     """By how the two go on: the wrong one turns with the line of sight. At first, a bias of the gyroscope does, too."""
     ekf, T = flown(UPRIGHT, angle, speed=1.0, seconds=2.0)
     assert off_by(ekf, T) < 0.02
+
+
+def test_two_poses_that_others_have_brought_together_are_one():
+    """Vague poses move the wrong one to the right one before they show that it was wrong: odds of e^-6 stayed."""
+    ekf = PoseEkf(config())
+    for k in range(4 * 160):
+        stamp_ns = START_NS + 10_000_000 * k
+        ekf.add_imu(ImuSample(stamp_ns, np.zeros(3), np.array([0.0, 0.0, GRAVITY])))
+        if k % 4 == 3:
+            vague = by_marker(stamp_ns, LEVEL @ T_BODY_CAMERA, 0.1)
+            ekf.add_pose(either(stamp_ns, LEVEL, UPRIGHT, 0.42, 0.06) if k < 8 else vague)
+    # As above, with exact poses and samples.
+    assert off_by(ekf, LEVEL) < 0.02
