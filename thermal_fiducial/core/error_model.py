@@ -12,10 +12,12 @@ jump by what the markers are wrong by.
 """
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import lever_arm
+from thermal_fiducial.core.measurements import LATE
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 
@@ -41,7 +43,7 @@ class SystematicErrors:
     aspect: float = 1.0
     #: How much of a rolling shutter's readout time is not declared [s]: cores read their rows in 8 to 33 ms, or all at
     #: once. Prior of its estimate, by frames and in an adjustment of the map, whose covariances have what that leaves;
-    #: enters poses by that (``UndeclaredReadout``).
+    #: enters corners by that (``UndeclaredReadout``), and with these poses and new markers.
     readout_time_std: float = 0.015
     #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges. To
     #: begin with, and at most, as measured on rendered flights with three lenses and 0.5 to 9 K; learned in flight from
@@ -81,10 +83,17 @@ INCONSISTENT_PX = 0.3
 WHITE_PX = 0.5
 #: Covariance of an unknown acceleration of robot and camera in a brisk flight: 3 m/s^2, 4 rad/s^2.
 UNKNOWN_ACCELERATION = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2
+#: Standard deviations of a robot's velocity [m/s] and turn rate [rad/s], each along any axis, where nothing measures
+#: them: medians over rendered missions are 0.3 and 0.5. Enter poses without odometry, by rows that are read late and by
+#: the turn since the last frame.
+USUAL_SPEED, USUAL_RATE = 0.5, 0.5
 #: Joint draws of the errors of a map: standard deviations by 64 are accurate to a tenth, those by the lens exact.
 DRAWS = 64
 #: Those of a marker whose place is known exactly.
 NO_DRAWS: FloatArray = np.zeros((6, DRAWS))
+#: (7, K) those of what is not known of rows that are read late, in standard deviations: the readout time is the same in
+#: all frames, and so may the motion be in the few that have no odometry.
+LATE_DRAWS: FloatArray = math.sqrt(DRAWS) * np.linalg.qr(np.random.default_rng(0).standard_normal((DRAWS, LATE)))[0].T
 #: Directions in which a marker's error is smaller than this share of its largest standard deviation inherit nothing.
 _LEAST_STD = 1e-6
 

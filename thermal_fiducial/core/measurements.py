@@ -59,6 +59,9 @@ MAP_DTYPE = np.dtype(
     + [('observations', '<u4'), ('fixed', '<u1'), ('trusted', '<u1'), ('in_view', '<u1')]
 )
 
+#: Number of the unknowns of rows that are read late.
+LATE = 7
+
 #: The structured array of the markers of one frame, shape (N,) of :data:`MARKER_DTYPE`.
 Markers = np.ndarray
 
@@ -159,11 +162,14 @@ class Observations(Stacked):
     detector_px: FloatArray
     #: (N, 2, 4, 4) T_camera_marker and its alternative, NaN where there is none
     branches: FloatArray
-    #: (N, 4, 2, 6) derivative of the corners by what the camera moves from the first row's readout to the last's [m,
-    #: rad], in map axes; zero where no motion is known
+    #: (N, 4, 2, 6) derivative by a displacement of the camera from the first row to the last [m, rad], in map axes, or
+    #: those of the camera where nothing predicts it; zero where the readout time is exactly known
     by_readout: FloatArray
-    #: (N,) standard deviation of a coordinate by what is not known of the readout time [px]
-    readout_px: FloatArray
+    #: (N, 4, 2) velocity of the corners by the share of the rows at which each is read [px/s]
+    rates: FloatArray
+    #: (N, 4, 2, 7) displacement by one standard deviation of each of what is not known of rows that are read late [px]:
+    #: the readout time, and six of the camera's motion
+    late_px: FloatArray
 
     @staticmethod
     def of(markers: Markers) -> 'Observations':
@@ -182,17 +188,22 @@ class Observations(Stacked):
         poses = poses.reshape(-1, 2, 7)
         with np.errstate(invalid='ignore', divide='ignore'):
             branches = transform_from_quaternion(poses[..., :3], poses[..., 3:])
-        ids, count = markers['id'].astype(np.int64), len(markers)
-        observations = Observations(
-            ids, corners, covariances, detector_px[:, 0], branches, np.zeros((count, 4, 2, 6)), np.zeros(count)
-        )
+        by_readout, rates = np.zeros((len(markers), 4, 2, 6)), np.zeros((len(markers), 4, 2))
+        late_px = np.zeros((len(markers), 4, 2, LATE))
+        ids = markers['id'].astype(np.int64)
+        observations = Observations(ids, corners, covariances, detector_px[:, 0], branches, by_readout, rates, late_px)
         uu, uv, vv = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
         sound = (uu > 0.0) & (uu * vv > uv**2) & np.isfinite(corners).all(axis=2)
         usable: BoolArray = np.asarray(sound.all(axis=1))
-        if len(set(ids.tolist())) < count:
+        if len(set(ids.tolist())) < len(ids):
             _, place, times = np.unique(ids, return_inverse=True, return_counts=True)
             usable &= times[place] == 1
         return observations if usable.all() else observations.only(usable)
+
+    @property
+    def readout_px(self) -> FloatArray:
+        """Standard deviation (N,) of a coordinate by what is not known of rows that are read late."""
+        return np.asarray(np.sqrt(np.sum(self.late_px**2, axis=-1).mean(axis=(1, 2))))
 
 
 _IMU_SHAPES = {'angular_velocity': (3,), 'linear_acceleration': (3,)}

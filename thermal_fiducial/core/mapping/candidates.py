@@ -161,7 +161,14 @@ class NewMarkers:
             size = self._sizes.get(marker_id, self._size)
             candidate = self.candidates.setdefault(marker_id, Candidate(marker_id, size))
             candidate.add(
-                MarkerView(stamp_ns, viewpoint, observed.corners[i], observed.covariances[i], observed.branches[i])
+                MarkerView(
+                    stamp_ns,
+                    viewpoint,
+                    observed.corners[i],
+                    observed.covariances[i],
+                    observed.branches[i],
+                    observed.late_px[i],
+                )
             )
             shown.append(candidate)
         placed = []

@@ -24,7 +24,7 @@ from thermal_fiducial.core.geometry.se3 import lever_arm, retract, screw_differe
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.located import Location, Reprojected, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE
-from thermal_fiducial.core.measurements import CameraPose, NOTHING_KNOWN, VAGUE
+from thermal_fiducial.core.measurements import CameraPose, LATE, NOTHING_KNOWN, VAGUE
 from thermal_fiducial.core.two_poses import DECISIVE
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
@@ -113,8 +113,8 @@ class JointFit:
     ) -> Location | None:
         """The pose (4, 4) corrected by ``step`` (6,), with its covariance; None if that is not finite.
 
-        The covariance is the sum of white corner noise, scaled up by ``noise``, of errors of the map's markers, and
-        of systematic errors of corners and scale by the error model.
+        The covariance is the sum of white corner noise, scaled up by ``noise``, of errors of the map's markers, of
+        systematic errors of corners and scale by the error model, and of what is not known of rows that are read late.
 
         Parameters
         ----------
@@ -134,7 +134,8 @@ class JointFit:
         of_map = covariance_of_one_error(of_sides)
         if np.any(sight.map_covariances):
             of_map += covariance_by_draws(drawn_sum(map_gains, sight.draws))
-        covariance = white + lens.covariance(by_corner) + of_map
+        late = drawn_sum(by_corner, sight.observed.late_px.reshape(-1, 2, LATE))
+        covariance = white + lens.covariance(by_corner) + of_map + late @ late.T
         if not np.all(np.isfinite(covariance)):
             return None
         # Part of the lens's covariance, and wrong for as long as the map is: no mean over poses removes it.

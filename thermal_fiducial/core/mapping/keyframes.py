@@ -12,7 +12,6 @@ from thermal_fiducial.core.geometry.se3 import rigid_alignment
 from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot
 from thermal_fiducial.core.mapping.map_data import corners_of_markers, MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
-from thermal_fiducial.core.mapping.undeclared_readout import rates_of_rows
 from thermal_fiducial.core.measurements import CameraPose, Observations
 from thermal_fiducial.core.motion_prior import displacement_covariance, PredictedCamera
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
@@ -51,6 +50,8 @@ class Keyframe:
     bridge: bool = False
     #: (k, 4, 2) [px/s] what corners are displaced by each second that the readout time is declared too short by
     rates: FloatArray = field(default_factory=lambda: np.zeros((1, 1, 1)))
+    #: (k, 4, 2, 2) [px^2] what they may be displaced by where that velocity is not known
+    late: FloatArray = field(default_factory=lambda: np.zeros((1, 1, 1, 1)))
 
 
 def snapshot_of(
@@ -65,6 +66,11 @@ def snapshot_of(
     """At least one keyframe, and ``markers`` of the map to adjust, as a refinement works on them."""
     information = np.stack([frame.information for frame in frames])
     bridges = np.array([frame.bridge for frame in frames])
+    covariances = np.concatenate([frame.covariances for frame in frames])
+    # Where no velocity is known these are pictures, a few a second without odometry: what robots usually do would weigh
+    # their corners by rows.
+    if any(frame.rates.any() for frame in frames):
+        covariances += np.concatenate([np.broadcast_to(frame.late, frame.covariances.shape) for frame in frames])
     return Snapshot(
         markers,
         np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
@@ -74,7 +80,7 @@ def snapshot_of(
         np.repeat(np.arange(len(frames)), [len(frame.ids) for frame in frames]),
         np.concatenate([frame.ids for frame in frames]),
         np.concatenate([frame.corners for frame in frames]),
-        np.concatenate([frame.covariances for frame in frames]),
+        covariances,
         np.concatenate([np.broadcast_to(frame.rates, frame.corners.shape) for frame in frames]),
         known,
         map_revision,
@@ -269,11 +275,12 @@ class KeyframeStore:
             self._carry_over(self._camera, camera)
         self._camera = camera
         frame = Keyframe(pose.stamp_ns, pose.T_map_camera, observed.ids, observed.corners, observed.covariances)
+        rates, late = _displaced(observed)
+        frame = replace(frame, rates=rates, late=late)
         if predicted is None:
             return frame
         information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
-        rates = _where_known(*rates_of_rows(observed, predicted))
-        return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information, rates=rates)
+        return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
 
     def _carry_over(self, before: Camera, now: Camera) -> None:
         """Give all keyframes the pixels that their directions have by another calibration."""
@@ -317,10 +324,17 @@ class KeyframeStore:
         return cells
 
 
-def _where_known(rates: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Rates (k, 4, 2) of a frame, zero where odometry does not know its velocity."""
-    known = np.sum(rates**2) > _SURE**2 * np.trace(covariances, axis1=-2, axis2=-1).sum()
-    return rates if known else np.zeros_like(rates)
+def _displaced(observed: Observations) -> tuple[FloatArray, FloatArray]:
+    """Rates (k, 4, 2) of markers, zero where their velocity is not known, and covariances (k, 4, 2, 2) by that.
+
+    What is not known of the velocity displaces late rows as noise would.
+    """
+    late = observed.late_px.copy()
+    squares = np.sum(late**2, axis=(1, 2))
+    known = squares[:, 0] > _SURE**2 * squares[:, 1:].sum(axis=1)
+    late[known, ..., 0] = 0.0
+    rates = np.where(known[:, None, None], observed.rates, 0.0)
+    return rates, late @ np.swapaxes(late, -1, -2)
 
 
 def _fair_share(counts: list[int], room: int) -> int:

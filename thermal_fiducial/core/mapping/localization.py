@@ -9,7 +9,12 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import covariance_of_one_error, decision_weights, SystematicErrors
+from thermal_fiducial.core.error_model import (
+    covariance_of_one_error,
+    decision_weights,
+    SystematicErrors,
+    USUAL_RATE,
+)
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit
 from thermal_fiducial.core.geometry.se3 import difference, inverse, screw_difference, turn_between
@@ -26,15 +31,13 @@ _PROPOSERS = 4
 _MEANINGLESS = 1.0
 # Longest time [ns] for which the last pose resolves the planar ambiguity of the next.
 _CONTINUITY_NS = 300_000_000
-# Standard deviation of a robot's rates about each axis [rad/s], where nothing measures them.
-_USUAL_RATE = 0.5
 
 
 def last_at(stamp_ns: int, last: CameraPose | None) -> CameraPose | None:
     """The ``last`` pose for a frame that follows soon, uncertain by what a robot may have turned since."""
     if last is None or not 0 < stamp_ns - last.stamp_ns < _CONTINUITY_NS:
         return None
-    turn = _USUAL_RATE * (stamp_ns - last.stamp_ns) / SECOND_NS
+    turn = USUAL_RATE * (stamp_ns - last.stamp_ns) / SECOND_NS
     return last.widened(np.diag([0.0, 0.0, 0.0, turn, turn, turn]) ** 2)
 
 

@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import arms_of_scale, drawn_sum, INCONSISTENT_PX, NO_DRAWS
+from thermal_fiducial.core.error_model import arms_of_scale, drawn_sum, INCONSISTENT_PX, LATE_DRAWS, NO_DRAWS
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise
 from thermal_fiducial.core.geometry.se3 import difference, lever_arm, screwed, turn_of_pose
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
-from thermal_fiducial.core.measurements import CameraPose, Observations, VAGUE
+from thermal_fiducial.core.measurements import CameraPose, LATE, Observations, VAGUE
 from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked
 from thermal_fiducial.core.wording import listed, marker_names
@@ -155,6 +155,7 @@ class Location:
     def viewpoint(self) -> Viewpoint:
         """The camera as viewpoint of new markers: all but its noise is common to all views."""
         draws = self.lens.drawn_sum(self.corner_gains) + drawn_sum(self.map_gains, self.sight.draws)
+        draws += drawn_sum(self.corner_gains, self.sight.observed.late_px.reshape(-1, 2, LATE)) @ LATE_DRAWS
         return Viewpoint.known(self.pose.T_map_camera, self.noise, draws, self.of_sides)
 
 

@@ -118,15 +118,17 @@ class MarkerMapper:
         ----------
         markers : (N,) of MARKER_DTYPE
         camera : its intrinsics
-        prior : the filter's odometry and clock offset; resolves ambiguities, bridges gaps between known markers
+        prior : the filter's odometry and clock offset; resolves ambiguities, bridges gaps between known markers. None
+            for pictures of a camera that stands still
         """
         return self.learn(self.locate(stamp_ns, markers, camera, prior))
 
     def locate(self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None) -> LocatedFrame:
         """First half of :meth:`process`, up to the pose, which can be published before the map is updated."""
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
-        errors = self._errors_of(camera)
-        raw = self.readout.with_readout_derivative(Observations.of(markers), camera, predicted)
+        raw, errors = Observations.of(markers), self._errors_of(camera)
+        # Pictures without any odometry are of a camera that stands still.
+        raw = raw if prior is None else self.readout.with_readout_derivative(stamp_ns, raw, camera, predicted)
         observed = self.readout.corrected(raw, predicted)
         observed = replace(observed, corners=without_found_aspect(observed.corners, camera, errors))
         # Step 2: known and new markers.
@@ -138,8 +140,6 @@ class MarkerMapper:
             odometry, last = (None, last_at(stamp_ns, self._last)) if predicted is None else (predicted.pose, None)
             fit = partial(locate, stamp_ns, camera=camera, errors=errors, odometry=odometry, last=last)
             outcome = from_consistent_markers(sight, camera, predicted, fit)
-            if isinstance(outcome, Location):
-                outcome = self.readout.claimed(outcome, predicted)
         elif len(known.sizes):
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:

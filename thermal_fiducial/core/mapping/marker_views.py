@@ -1,7 +1,7 @@
 """Fit of a marker's pose to its views; the camera pose of a view is uncertain, and may be one of two."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from thermal_fiducial.core.error_model import (
     drawn_sum,
     DRAWS,
     independent_sum,
+    LATE_DRAWS,
     noise_factor,
     SystematicErrors,
     with_corner_errors,
@@ -22,6 +23,7 @@ from thermal_fiducial.core.geometry.reprojection import linearise, marker_corner
 from thermal_fiducial.core.geometry.rigid_fit import minimise, Quadratic, SINGULAR
 from thermal_fiducial.core.geometry.se3 import rotation_angle, screwed
 from thermal_fiducial.core.lens_errors import LensErrors
+from thermal_fiducial.core.measurements import LATE
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
 #: Of a camera pose that no error of the sides has moved.
@@ -97,6 +99,8 @@ class MarkerView:
     corner_covariances: FloatArray
     #: (2, 4, 4) both branches of T_camera_marker, the better one first
     branches: FloatArray
+    #: (4, 2, 7) displacement of the corners by what is not known of rows that are read late [px]
+    late_px: FloatArray = field(default_factory=lambda: np.zeros((4, 2, LATE)))
 
     @cached_property
     def direction(self) -> FloatArray:
@@ -159,8 +163,10 @@ class MarkerViews:
         self._corners, self._of_lens = corners.reshape(-1, 8), LensErrors(corners, camera, errors)
         covariances = np.stack([view.corner_covariances for view in views])
         self._noise = block_diagonal(covariances)
-        #: with the bias of the corners, for weights and decisions
-        self._uncertain = block_diagonal(with_corner_errors(covariances))
+        self._late = np.stack([view.late_px for view in views]).reshape(-1, 8, LATE)
+        #: with the bias of the corners and late rows, for weights and decisions
+        by_late = self._late @ np.swapaxes(self._late, -1, -2)
+        self._uncertain = block_diagonal(with_corner_errors(covariances)) + by_late
         self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
         self._camera_noise = np.stack([view.viewpoint.covariances for view in views])
         self._of_sides = np.stack([view.viewpoint.of_sides for view in views])
@@ -203,7 +209,8 @@ class MarkerViews:
     def errors(self, fits: FittedPoses, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error but for the sides.
 
-        The errors are the corners', whose covariance counts ``noise`` times, and those of the cameras' poses.
+        The errors are the corners', whose covariance counts ``noise`` times, those of late rows, and those of the
+        cameras' poses.
         """
         own = np.arange(len(fits.chosen)), fits.chosen
         _, J_camera, J_marker = self._at_best(fits)
@@ -213,7 +220,9 @@ class MarkerViews:
         by_corner = white @ np.swapaxes(J_marker, -1, -2) @ fits.W
         of_sides = np.einsum('vij,vj->i', gains, self._of_sides)
         of_lens = self._of_lens.drawn_sum(by_corner.reshape(-1, 6, 4, 2).swapaxes(1, 2).reshape(-1, 6, 2))
-        shared = drawn_sum(gains, self._draws[own]) + of_lens
+        # The time that moves these corners has moved those that the camera is known by.
+        of_late = drawn_sum(by_corner, self._late) @ LATE_DRAWS
+        shared = drawn_sum(gains, self._draws[own]) + of_lens + of_late
         alone = independent_sum(by_corner, self._noise) + independent_sum(gains, self._camera_noise[own])
         alone *= noise
         of_noise = np.linalg.cholesky(alone) @ rng.standard_normal((6, DRAWS))

@@ -3,21 +3,25 @@
 The detector moves corners to the stamp by the declared time. If that is too short by d, a corner at the share s of the
 rows, -1/2 in the first one and 1/2 in the last, stays displaced by d s times its velocity in the image. The pose of the
 frame takes up a part of that; what it leaves, in all frames, shows d by least squares. Where the map is made in the
-same flight, its adjustment has d among its unknowns, and knows better. Poses always claim what is not known of it.
+same flight, its adjustment has d among its unknowns, and knows better. Poses, new markers and keyframes always claim
+what is not known of it, by their corners.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import math
 
 import numpy as np
 
 from thermal_fiducial.core.error_model import (
-    covariance_of_one_error,
+    covariance_root,
     drawn_sum,
     DRAWS,
     noise_factor,
     READOUT_AS_DECLARED,
     SQUARE_STD,
+    UNKNOWN_ACCELERATION,
+    USUAL_RATE,
+    USUAL_SPEED,
 )
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, inverse_2x2
 from thermal_fiducial.core.geometry.planar_pose import INLIER, squareness
@@ -26,7 +30,7 @@ from thermal_fiducial.core.geometry.se3 import turn_of_pose
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.motion_prior import PredictedCamera
-from thermal_fiducial.core.types import FloatArray, TINY
+from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS, TINY
 
 # Standard deviations by which the time must be off to be named. In flights as declared it is up to 2.7.
 _CONTRADICTS = 4.0
@@ -46,6 +50,31 @@ class ReadoutEstimate:
         return abs(self.seconds) / math.hypot(self.std, READOUT_AS_DECLARED)
 
 
+@dataclass(frozen=True)
+class ImageMotion:
+    """The corners of a frame, from which those of the next one have moved."""
+
+    stamp_ns: int = 0
+    #: (M,), and (M, 4, 2) [px]
+    ids: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    corners: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 2)))
+
+    def until(self, stamp_ns: int, observed: Observations) -> tuple[FloatArray, FloatArray]:
+        """Velocity (N, 4, 2) of the corners of N markers [px/s], and what that of the camera may be beside (N, 6).
+
+        The mean velocity of the time between is that in its middle; since then the camera may have accelerated. Of a
+        marker that was not in that frame, or too long ago, nothing is known but what robots usually do [m/s, rad/s].
+        """
+        seconds = (stamp_ns - self.stamp_ns) / SECOND_NS
+        usual = np.repeat((USUAL_SPEED, USUAL_RATE), 3)
+        accelerated = 0.5 * seconds * np.sqrt(UNKNOWN_ACCELERATION.diagonal())
+        flow, unsure = np.zeros_like(observed.corners), np.tile(usual, (len(observed.ids), 1))
+        if seconds > 0.0 and np.all(accelerated < usual):
+            _, now, before = np.intersect1d(observed.ids, self.ids, return_indices=True)
+            flow[now], unsure[now] = (observed.corners[now] - self.corners[before]) / seconds, accelerated
+        return flow, unsure
+
+
 class UndeclaredReadout:
     """What the readout time of a camera is declared too short by: its prior, and what frames and the map show of it."""
 
@@ -58,46 +87,50 @@ class UndeclaredReadout:
         self._information, self._weighted, self._variance = 0.0, 0.0, 0.0
         self._common: FloatArray = np.zeros(DRAWS)
         self._is_by_map = False
+        self._before = ImageMotion()
 
     def with_readout_derivative(
-        self, observed: Observations, camera: Camera, predicted: PredictedCamera | None
+        self, stamp_ns: int, observed: Observations, camera: Camera, predicted: PredictedCamera | None
     ) -> Observations:
-        """The observations with the derivative of their corners by what the camera moves in the readout.
+        """N markers with what displaces their corners where rows are read late, as the detector has them.
 
-        It is that of the detector's corners, not of the image's: rows that are read late bend the outline of a marker,
-        and the detector pulls it towards a square as far as the noise of the corners allows (``as_squares``).
+        Such rows bend the outline of a marker, and the detector pulls it towards a square as far as the noise of the
+        corners allows (``as_squares``). Before the filter has its first pose the velocity is that of the corners since
+        the frame before: the first frames would choose between the two poses of a marker by an outline that is bent
+        towards the wrong one.
         """
-        if predicted is None or self._prior_std == 0.0 or len(observed.ids) == 0:
+        before, self._before = self._before, ImageMotion(stamp_ns, observed.ids, observed.corners)
+        if self._prior_std == 0.0 or len(observed.ids) == 0:
             return observed
-        points, R = ImagePoints.at(observed.corners, camera), predicted.pose.T_map_camera[:3, :3]
-        depths = _depths(points.x, observed.branches[:, 0])
-        J_camera = points.J @ interaction(points.x, depths) @ turn_of_pose(R.T)
-        displaced = camera.readout_shares(observed.corners[..., 1])[..., None, None] * J_camera
+        points = ImagePoints.at(observed.corners, camera)
+        R = np.eye(3) if predicted is None else predicted.pose.T_map_camera[:3, :3]
+        J_camera = points.J @ interaction(points.x, _depths(points.x, observed.branches[:, 0])) @ turn_of_pose(R.T)
+        flow, unsure = before.until(stamp_ns, observed)
+        moved = np.concatenate([J_camera, flow[..., None]], axis=-1)
+        displaced = camera.readout_shares(observed.corners[..., 1])[..., None, None] * moved
         J = squareness(points.x, points.inverse)[1].reshape(-1, 2, 4, 2).swapaxes(1, 2)
         spread = observed.covariances @ J.swapaxes(-1, -2)
         information = inverse_2x2((J @ spread).sum(axis=1) + SQUARE_STD**2 * np.eye(2))
         pulled = information @ (J @ displaced).sum(axis=1)
-        return replace(observed, by_readout=displaced - spread @ pulled[:, None])
+        displaced -= spread @ pulled[:, None]
+        by_readout, by_flow = displaced[..., :6], displaced[..., 6:]
+        if predicted is None:
+            late = np.concatenate([by_flow, by_readout * unsure[:, None, None]], axis=-1)
+        else:
+            late = by_readout @ _motion(predicted)
+        return replace(observed, by_readout=by_readout, rates=late[..., 0], late_px=self.estimate.std * late)
 
     def corrected(self, observed: Observations, predicted: PredictedCamera | None) -> Observations:
         """The corners of N markers at the stamp, without what the time displaces them by in a camera in motion."""
         if predicted is None or self._prior_std == 0.0:
             return observed
-        seconds, (rates, unsure) = self.estimate.seconds, rates_of_rows(observed, predicted)
+        seconds, by_readout = self.estimate.seconds, observed.by_readout
+        unsure = by_readout @ predicted.velocity_covariance(1.0) @ by_readout.swapaxes(-1, -2)
         return replace(
             observed,
-            corners=observed.corners - seconds * rates,
+            corners=observed.corners - seconds * observed.rates,
             covariances=observed.covariances + seconds**2 * unsure,
-            readout_px=self.estimate.std * np.sqrt(np.mean(rates**2, axis=(1, 2))),
         )
-
-    def claimed(self, location: Location, predicted: PredictedCamera | None) -> Location:
-        """The location, whose covariance has what is not known of the time."""
-        if predicted is None or self.estimate.std == 0.0:
-            return location
-        rates = (location.sight.observed.by_readout @ predicted.velocity).reshape(-1, 2)
-        moved = np.einsum('nij,nj->i', location.corner_gains, rates)
-        return replace(location, pose=location.pose.widened(covariance_of_one_error(moved, self.estimate.std)))
 
     def add(self, location: Location, predicted: PredictedCamera | None) -> None:
         """Update with the residuals of a frame that was corrected by the time as known so far."""
@@ -154,10 +187,10 @@ class UndeclaredReadout:
         return f'rows are read over {off:.1f} +- {std:.1f} ms {more} than readout_time says: {add} {1e-3 * off:.4f}'
 
 
-def rates_of_rows(observed: Observations, predicted: PredictedCamera) -> tuple[FloatArray, FloatArray]:
-    """Displacement (N, 4, 2) of the corners of N markers by each second of the time [px/s], and its covariances."""
-    by_readout, unsure = observed.by_readout, predicted.velocity_covariance(1.0)
-    return by_readout @ predicted.velocity, by_readout @ unsure @ by_readout.swapaxes(-1, -2)
+def _motion(predicted: PredictedCamera) -> FloatArray:
+    """Root (6, 7) of the second moments of the camera's velocity [m/s, rad/s]: its mean, and what it is unsure by."""
+    unsure = covariance_root(predicted.velocity_covariance(1.0))
+    return np.concatenate([predicted.velocity[:, None], unsure], axis=1)
 
 
 def _depths(x: FloatArray, T_camera_marker: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.geometry.se3 import difference, inverse, lever_arm, retract, so3_exp, transform
 from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers, WRONG_SIDE
 from thermal_fiducial.core.mapping.marker_views import MarkerView, MarkerViews, Viewpoint
-from thermal_fiducial.core.measurements import corners_px, NOTHING_KNOWN, Observations
+from thermal_fiducial.core.measurements import corners_px, LATE, NOTHING_KNOWN, Observations
 
 # What lies far beside the axis a lens with distortion throws farthest.
 CAMERA = replace(STRAIGHT, D=np.array([-0.3, 0.12, 0.0, 0.0, -0.02]))
@@ -81,7 +81,8 @@ def test_a_marker_enters_where_it_is_though_the_calibration_changes_meanwhile(ch
             np.zeros(1),
             own.branches[None],
             np.zeros((1, 4, 2, 6)),
-            np.zeros(1),
+            np.zeros((1, 4, 2)),
+            np.zeros((1, 4, 2, LATE)),
         )
         placed += new.add_views(own.stamp_ns, shown, camera, own.viewpoint, errors)[0]
     (marker,) = placed

@@ -26,7 +26,9 @@ from thermal_fiducial.core.geometry.se3 import difference
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.undeclared_readout import ReadoutEstimate, UndeclaredReadout
-from thermal_fiducial.core.measurements import corners_px
+from thermal_fiducial.core.measurements import corner_covariances, corners_px
+from thermal_fiducial.core.motion_prior import MotionPrior
+from thermal_fiducial.core.two_poses import possible_poses
 
 #: The camera is the body.
 CONFIG = MarkerMapperConfig(
@@ -122,6 +124,104 @@ def test_poses_claim_what_is_not_known_of_it_yet(readout, mode):
     """In the first frames of a brisk flight; while nothing was claimed before it was found, 16 ms had 3 to 4."""
     _, located = flown(brisk, readout, seconds=0.2, mode=mode)
     assert nees(located) < 1.0
+
+
+def at_first_sight(readout, markers, frames, rng):
+    """Camera poses of a brisk flight by so many markers, each the first one or the second of a mapper; true poses."""
+    poses = wall(rng)
+    known = MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in poses.items()})
+    for t in np.arange(0.0, 6.0, 4.0 / 30.0):
+        mapper = MarkerMapper(CONFIG, known)
+        for k in range(frames):
+            seen = read_row_by_row(brisk, t + k / 30.0, poses, readout, rng)[:markers]
+            pose = mapper.process(stamp(k), seen, CAMERA, MotionPrior()).pose
+        if pose is not None:
+            yield possible_poses(pose), brisk(t + k / 30.0)
+
+
+@pytest.mark.parametrize('readout', [0.016, 0.0, -0.016])
+@pytest.mark.parametrize('markers', [1, 3])
+@pytest.mark.parametrize('frames', [1, 2])
+def test_poses_before_any_odometry_claim_what_late_rows_may_do(readout, markers, frames):
+    """While they claimed nothing of it, 16 ms had 6 by one marker and 8 by three."""
+    located = list(at_first_sight(readout, markers, frames, np.random.default_rng(5)))
+    nearest = [min(((0.0, pose, truth) for pose in poses), key=lambda one: nees([one])) for poses, truth in located]
+    assert len(nearest) > 35
+    # By one marker the claim is linear, and late rows turn a marker from the front by more.
+    assert nees(nearest) < 1.2
+
+
+def test_a_camera_at_rest_claims_little_of_late_rows_from_its_second_frame_on():
+    """Before one marker far away, with what robots usually do in its claim, there was no pose for seconds."""
+    rng = np.random.default_rng(5)
+    poses = wall(rng)
+    mapper = MarkerMapper(CONFIG, MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in poses.items()}))
+    known = MarkerMapper(replace(CONFIG, readout_time_std=0.0), mapper.map)
+    variances = []
+    for k in range(2):
+        seen = read_row_by_row(lambda t: brisk(0.0), 0.0, poses, 0.016, rng)
+        located = [one.process(stamp(k), seen, CAMERA, MotionPrior()).pose for one in (mapper, known)]
+        variances.append([np.trace(pose.covariance) for pose in located])
+    (first, least), (second, _) = variances
+    # An unknown acceleration of a frame's time is left, an eighth of what it may be at first sight.
+    assert second - least < 0.04 * (first - least)
+
+
+def test_pictures_of_a_camera_without_odometry_claim_no_motion():
+    rng = np.random.default_rng(5)
+    poses = wall(rng)
+    known = MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in poses.items()})
+    seen = read_row_by_row(brisk, 0.0, poses, 0.0, rng)
+    still, moving = (
+        MarkerMapper(CONFIG, known).process(0, seen, CAMERA, prior).pose for prior in (None, MotionPrior())
+    )
+    assert np.trace(still.covariance) < 0.5 * np.trace(moving.covariance)
+
+
+@pytest.mark.parametrize('readout', [0.033, 0.016, 0.0, -0.016])
+def test_new_markers_claim_what_is_not_known_of_it(readout):
+    """Before the first adjustment; while the corners that they are placed by claimed nothing: 2, and 10 for 33 ms."""
+    mapper, _ = flown(brisk, readout, seconds=2.0, mode='mapping', refinement_period=0.0)
+    true = wall(np.random.default_rng(5))
+    placed = [marker for marker in mapper.map.markers.values() if not marker.fixed]
+    assert len(placed) == len(true) - 1
+    errors = [(difference(marker.T_map_marker, true[marker.id]), marker.covariance) for marker in placed]
+    # 1.0 where the time is 2.2 of its standard deviations, else at most 0.4.
+    assert np.mean([error @ np.linalg.solve(C, error) / 6.0 for error, C in errors]) < 1.2
+
+
+def test_keyframes_before_any_odometry_have_the_velocities_of_their_corners():
+    """Without these an adjustment takes corners for undisplaced that are pixels off."""
+    poses = wall(np.random.default_rng(5))
+    known = MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in poses.items()})
+    mapper, rng = MarkerMapper(replace(CONFIG, mode='mapping'), known), np.random.default_rng(6)
+    for k in range(2):
+        seen = read_row_by_row(brisk, k / 30.0, poses, 0.016, rng)
+        mapper.process(stamp(k), seen, CAMERA, MotionPrior())
+    now = mapper.snapshot()
+    first, second = now.frame == 0, now.frame == 1
+    stds = np.sqrt(np.trace(now.covariances, axis1=-2, axis2=-1))
+    # At first sight nothing is known of them, and corners far from the middle row may move by pixels; noise is 0.05.
+    assert not now.rates[first].any()
+    assert stds[first].max() > 1.0
+    at_once = corners_px(read_row_by_row(brisk, 1.0 / 30.0, poses, 0.0, rng))
+    displaced = 0.016 * now.rates[second]
+    # Of 1 to 4 px an acceleration of half a frame's time leaves a tenth.
+    assert np.sqrt(np.mean((now.corners[second] - at_once - displaced) ** 2)) < 0.2 * np.sqrt(np.mean(displaced**2))
+    assert stds[second].max() < 0.5 * stds[first].max()
+
+
+def test_corners_of_pictures_are_weighed_by_their_noise():
+    """A few a second, without odometry: nothing says how the camera moves."""
+    poses = wall(np.random.default_rng(5))
+    known = MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in poses.items()})
+    mapper, rng = MarkerMapper(replace(CONFIG, mode='mapping'), known), np.random.default_rng(6)
+    noise = []
+    for k in range(3):
+        seen = read_row_by_row(brisk, k / 3.0, poses, 0.0, rng)
+        mapper.process(stamp(10 * k), seen, CAMERA, MotionPrior())
+        noise.append(corner_covariances(seen))
+    assert np.allclose(mapper.snapshot().covariances, np.concatenate(noise), rtol=1e-6)
 
 
 def test_what_is_exactly_as_declared_is_not_estimated():
