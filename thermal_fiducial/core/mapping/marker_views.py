@@ -24,7 +24,7 @@ from thermal_fiducial.core.geometry.rigid_fit import minimise, Quadratic, SINGUL
 from thermal_fiducial.core.geometry.se3 import rotation_angle, screwed
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.measurements import LATE
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked, TINY
 
 #: Of a camera pose that no error of the sides has moved.
 NOT_MOVED: FloatArray = np.zeros(6)
@@ -120,25 +120,8 @@ class MarkerView:
         return replace(self, viewpoint=replace(self.viewpoint, T_map_camera=T_map_camera))
 
 
-@dataclass(frozen=True)
-class FittedPoses:
-    """Results of S fits of a marker's pose to n views, the best first."""
-
-    #: (S, 4, 4)
-    T: FloatArray
-    #: (S,) of the residuals, and with those of the cameras' own poses: minus twice the logarithm of the likelihood
-    chi2: FloatArray
-    cost: FloatArray
-    #: of the best one (n,) which of each camera's two poses was used
-    chosen: IntArray
-    #: and, as its weights have them: (n, 4, 4), (n, 8) [px], (n, 8, 8)
-    T_map_camera: FloatArray
-    displaced: FloatArray
-    W: FloatArray
-
-
-@dataclass(frozen=True)
-class _Weights:
+@dataclass(frozen=True, slots=True)
+class ViewWeights(Stacked):
     """Weights of n views of S markers, as decided from where the markers and their cameras were taken to be."""
 
     #: (S, n, 4, 4) where each camera was likeliest
@@ -152,6 +135,20 @@ class _Weights:
     costs: FloatArray
     #: (S, n, 6) displacement of each camera from the pose that is known to where it is likeliest now
     likeliest: FloatArray
+
+
+@dataclass(frozen=True)
+class FittedPoses:
+    """Results of S fits of a marker's pose to n views, the best first."""
+
+    #: (S, 4, 4)
+    T: FloatArray
+    #: (S,) of the residuals, and with those of the cameras' own poses: minus twice the logarithm of the likelihood
+    chi2: FloatArray
+    cost: FloatArray
+    #: of the best one: (n,) which of each camera's two poses was used, and the weights
+    chosen: IntArray
+    weights: ViewWeights
 
 
 class MarkerViews:
@@ -195,16 +192,7 @@ class MarkerViews:
                 break
         cost = chi2 + np.sum(begun.of_cameras, axis=-1)
         order = np.argsort(cost, kind='stable')
-        best = order[0]
-        return FittedPoses(
-            T[order],
-            chi2[order],
-            cost[order],
-            used[best],
-            begun.T_map_camera[best],
-            begun.displaced[best],
-            begun.W[best],
-        )
+        return FittedPoses(T[order], chi2[order], cost[order], used[order[0]], begun.only(order[0]))
 
     def errors(self, fits: FittedPoses, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error but for the sides.
@@ -214,10 +202,10 @@ class MarkerViews:
         """
         own = np.arange(len(fits.chosen)), fits.chosen
         _, J_camera, J_marker = self._at_best(fits)
-        J_camera, J_marker = fits.W @ J_camera, fits.W @ J_marker
+        J_camera, J_marker = fits.weights.W @ J_camera, fits.weights.W @ J_marker
         white = np.linalg.inv(np.einsum('vri,vrj->ij', J_marker, J_marker))
         gains = -white @ np.einsum('vri,vrj->vij', J_marker, J_camera)
-        by_corner = white @ np.swapaxes(J_marker, -1, -2) @ fits.W
+        by_corner = white @ np.swapaxes(J_marker, -1, -2) @ fits.weights.W
         of_sides = np.einsum('vij,vj->i', gains, self._of_sides)
         of_lens = self._of_lens.drawn_sum(by_corner.reshape(-1, 6, 4, 2).swapaxes(1, 2).reshape(-1, 6, 2))
         # The time that moves these corners has moved those that the camera is known by.
@@ -239,7 +227,7 @@ class MarkerViews:
         r, _, J_marker = self._at_best(fits)
         from_centre = marker_corners(self._size) @ fits.T[0, :3, :3].T
         by_side = np.einsum('vcij,cj->vci', J_marker[..., :3].reshape(-1, 4, 2, 3), from_centre).reshape(-1, 8)
-        white = (fits.W @ np.concatenate([J_marker, by_side[..., None], r[..., None]], axis=-1)).reshape(-1, 8)
+        white = (fits.weights.W @ np.concatenate([J_marker, by_side[..., None], r[..., None]], axis=-1)).reshape(-1, 8)
         # What a pose may explain of side and residuals says nothing of the side.
         Q = np.linalg.qr(white[:, :6])[0]
         by_side, r = (white[:, 6:] - Q @ (Q.T @ white[:, 6:])).T
@@ -278,8 +266,8 @@ class MarkerViews:
 
     def _at_best(self, fits: FittedPoses) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of the best fit: residuals (n, 8) [px], and derivatives (n, 8, 6) by the cameras and by the marker."""
-        r, J_camera, J_marker = self._linearised(fits.T[:1], fits.T_map_camera[None])
-        return r[0] + fits.displaced, J_camera[0], J_marker[0]
+        r, J_camera, J_marker = self._linearised(fits.T[:1], fits.weights.T_map_camera[None])
+        return r[0] + fits.weights.displaced, J_camera[0], J_marker[0]
 
     def _linearised(self, T: FloatArray, T_map_camera: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Residuals (S, n, 8) [px] of markers at T, and derivatives (S, n, 8, 6) by the cameras and by the marker."""
@@ -289,7 +277,7 @@ class MarkerViews:
         uv, J_camera, J_marker = linearise(self._camera, T_map_camera.reshape(-1, 4, 4), T_map_marker, sizes)
         return self._corners - uv.reshape(shape), J_camera.reshape(*shape, 6), J_marker.reshape(*shape, 6)
 
-    def _weights(self, T: FloatArray, chosen: IntArray, of_best: IntArray, moved: FloatArray) -> _Weights:
+    def _weights(self, T: FloatArray, chosen: IntArray, of_best: IntArray, moved: FloatArray) -> ViewWeights:
         """Weights of the views of markers at T (S, 4, 4) from the chosen (S, n) and (S, 1) of the cameras' poses.
 
         A residual comes of the corners' noise, of the systematic part, and of the camera's own pose, which moves all
@@ -310,9 +298,9 @@ class MarkerViews:
         likeliest = (covariances @ np.swapaxes(J_camera, -1, -2) @ pulls)[..., 0] * np.minimum(1.0, _FARTHEST / sigmas)
         of_cameras = np.where(possible, self._chi2_of_cameras[own], np.inf)
         costs = np.sum(white * white, axis=(-1, -2)) + of_cameras
-        return _Weights(T_map_camera, displaced, W, of_cameras, costs, likeliest)
+        return ViewWeights(T_map_camera, displaced, W, of_cameras, costs, likeliest)
 
-    def _minimised(self, T: FloatArray, begun: _Weights) -> tuple[FloatArray, FloatArray]:
+    def _minimised(self, T: FloatArray, begun: ViewWeights) -> tuple[FloatArray, FloatArray]:
         """Poses (S, 4, 4) from starts, and their chi squares (S,), inf where there is none."""
 
         def evaluated(T: FloatArray) -> Quadratic:
