@@ -103,18 +103,13 @@ class UndeclaredReadout:
         if self._prior_std == 0.0 or len(observed.ids) == 0:
             return observed
         points = ImagePoints.at(observed.corners, camera)
+        shares = camera.readout_shares(observed.corners[..., 1])[..., None, None]
         R = np.eye(3) if predicted is None else predicted.pose.T_map_camera[:3, :3]
         J_camera = points.J @ interaction(points.x, _depths(points.x, observed.branches[:, 0])) @ turn_of_pose(R.T)
-        flow, unsure = before.until(stamp_ns, observed)
-        moved = np.concatenate([J_camera, flow[..., None]], axis=-1)
-        displaced = camera.readout_shares(observed.corners[..., 1])[..., None, None] * moved
-        J = squareness(points.x, points.inverse)[1].reshape(-1, 2, 4, 2).swapaxes(1, 2)
-        spread = observed.covariances @ J.swapaxes(-1, -2)
-        information = inverse_2x2((J @ spread).sum(axis=1) + SQUARE_STD**2 * np.eye(2))
-        pulled = information @ (J @ displaced).sum(axis=1)
-        displaced -= spread @ pulled[:, None]
-        by_readout, by_flow = displaced[..., :6], displaced[..., 6:]
+        by_readout = _as_detected(shares * J_camera, observed, points)
         if predicted is None:
+            flow, unsure = before.until(stamp_ns, observed)
+            by_flow = _as_detected(shares * flow[..., None], observed, points)
             late = np.concatenate([by_flow, by_readout * unsure[:, None, None]], axis=-1)
         else:
             late = by_readout @ _motion(predicted)
@@ -185,6 +180,15 @@ class UndeclaredReadout:
         off, std = 1e3 * abs(seconds), 1e3 * self.estimate.std
         more, add = ('more', 'add') if seconds > 0.0 else ('less', 'subtract')
         return f'rows are read over {off:.1f} +- {std:.1f} ms {more} than readout_time says: {add} {1e-3 * off:.4f}'
+
+
+def _as_detected(displaced: FloatArray, observed: Observations, points: ImagePoints) -> FloatArray:
+    """Displacements (N, 4, 2, m) of the corners in the image as the detector has them, which pulls them to squares."""
+    J = squareness(points.x, points.inverse)[1].reshape(-1, 2, 4, 2).swapaxes(1, 2)
+    spread = observed.covariances @ J.swapaxes(-1, -2)
+    information = inverse_2x2((J @ spread).sum(axis=1) + SQUARE_STD**2 * np.eye(2))
+    pulled = information @ (J @ displaced).sum(axis=1)
+    return np.asarray(displaced - spread @ pulled[:, None])
 
 
 def _motion(predicted: PredictedCamera) -> FloatArray:
