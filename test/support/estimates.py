@@ -33,7 +33,7 @@ def difference(state, other):
             phi,
             so3_left_jacobian_inverse(phi) @ extrinsics[:3, 3],
             other.systematic - state.systematic,
-            se3.difference(other.T_map_markers @ np.linalg.inv(state.T_map_markers), np.eye(4)),
+            se3.screw_difference(other.T_map_markers @ np.linalg.inv(state.T_map_markers), np.eye(4)),
         )
     )
 

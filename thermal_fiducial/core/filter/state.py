@@ -16,7 +16,7 @@ import numpy as np
 
 from thermal_fiducial.core.filter.evidence import ClockEvidence, MountEvidence
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
-from thermal_fiducial.core.geometry.se3 import inverse, lever_arm, retract, so3_exp, so3_left_jacobian, transform
+from thermal_fiducial.core.geometry.se3 import inverse, lever_arm, screwed, so3_exp, so3_left_jacobian, transform
 from thermal_fiducial.core.types import FloatArray
 
 #: Error coordinates by index. Core, expressed in the robot frame [rad, m/s, m],
@@ -33,7 +33,7 @@ TIME_OFFSET = 35
 EXTRINSICS = slice(36, 42)
 #: systematic error of the camera poses, which lasts as long as the view, in the robot frame [rad, m],
 SYSTEMATIC = slice(42, 48)
-#: T_map_markers, perturbed from the left [m, rad]: how the map's error of the poses has changed with their markers.
+#: T_map_markers, moved from the left along a screw [m, rad]: how the map's error of poses changes with their markers.
 MARKERS = slice(48, 54)
 SIZE = 54
 #: Coordinates that an IMU step propagates, and coordinates that they are propagated from.
@@ -103,7 +103,7 @@ class NavigationState:
 
     def moved_in_map(self, error: FloatArray) -> 'NavigationState':
         """The state with its core and the map of the markers corrected by ``error`` (54,)."""
-        T_map_markers = retract(np.eye(4), error[MARKERS]) @ self.T_map_markers
+        T_map_markers = screwed(np.eye(4), error[MARKERS]) @ self.T_map_markers
         return replace(self.moved(error[CORE]), T_map_markers=T_map_markers)
 
     def plus(self, error: FloatArray) -> 'NavigationState':

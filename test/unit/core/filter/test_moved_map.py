@@ -136,6 +136,23 @@ def test_markers_of_poor_maps_in_turns_are_consistent():
     assert max(off) < 0.1
 
 
+def test_the_origin_of_the_map_may_be_anywhere():
+    """Good markers and poor ones in turns, in maps whose origins are a kilometre apart."""
+    flight, std, far = Flight(seconds=3.0), np.repeat((0.1, 0.03), 3), transform(np.eye(3), [1000.0, -300.0, 0.0])
+    motion, outputs = std * np.array([1.2, -0.8, 0.5, -1.0, 0.7, 1.1]), []
+    for T_new_old in (np.eye(4), far):
+        ekf, poses = PoseEkf(config()), iter(range(1000))
+        for kind, item in events(flight):
+            if kind == 0:
+                outputs.append(ekf.add_imu(item))
+            else:
+                pose = with_poor_markers(item, motion, std) if next(poses) // 15 % 2 else item
+                ekf.add_pose(pose.in_moved_map(T_new_old))
+    near, moved = (output for output in np.array(outputs).reshape(2, -1)[:, -1])
+    # Rounding of covariances about that origin; it was 1.7 m.
+    np.testing.assert_allclose(moved.T_map_body, far @ near.T_map_body, atol=1e-6)
+
+
 def test_without_a_correction_the_jump_is_refused_at_first():
     # The negative control: poses in a map that moved by 1.4 m contradict the estimate.
     flight = Flight(seconds=2.8)
