@@ -268,11 +268,11 @@ class PoseEkf:
     @property
     def doubts(self) -> list[Condition]:
         """Parameters that the flight contradicts: the camera is turned on the robot, or the map leans."""
-        main = self._history.main
-        if main is None:
+        main, state = self._history.main, self.state
+        if main is None or state is None:
             return []
         turned = main.estimate.mount.contradiction(self._config.extrinsics_orientation_std)
-        return [doubt for doubt in (turned, leaning_map(main.estimate, self._config)) if doubt is not None]
+        return [doubt for doubt in (turned, leaning_map(main.estimate, state, self._config)) if doubt is not None]
 
     @property
     def status(self) -> str:

@@ -200,16 +200,21 @@ def _without_estimate(belief: Belief, config: PoseEkfConfig) -> Condition:
     return Condition('initialising', f'{begun.hits} of {config.initial_poses} poses') if begun else WAITING
 
 
-def leaning_map(estimate: Estimate, config: PoseEkfConfig) -> Condition | None:
-    """That the map leans against gravity by more than is declared.
+def leaning_map(estimate: Estimate, state: NavigationState, config: PoseEkfConfig) -> Condition | None:
+    """That the present map leans against gravity by more than is declared.
 
     Before one heading an accelerometer's bias looks the same; only turns show which of the two it is. What the map
     itself is bent by is no lean.
+
+    Parameters
+    ----------
+    state : that of ``estimate``, in the present map
     """
-    tilt, covariance = estimate.state.gravity[:2], estimate.covariance[GRAVITY, GRAVITY]
+    tilt, covariance = state.gravity[:2], estimate.covariance[GRAVITY, GRAVITY]
+    in_first = tilt @ (state.R_map_body @ estimate.state.R_map_body.T)[:2, :2]
     of_map = float(estimate.pose_noise.of_map.diagonal()[3:5].sum())
     square, claimed = float(tilt @ tilt), config.gravity**2 * (config.map_tilt_std**2 + of_map)
-    if square**2 <= _LEANS * (claimed * square + float(tilt @ covariance @ tilt)):
+    if square**2 <= _LEANS * (claimed * square + float(in_first @ covariance @ in_first)):
         return None
     # What is declared keeps the estimate near to it.
     off, says = math.sqrt(square) / config.gravity, math.degrees(config.map_tilt_std)

@@ -7,7 +7,7 @@ import pytest
 from support.flights import config, Flight, GRAVITY, Motion, run, timeline
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.geometry.se3 import so3_exp
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 
 
 def flown(tilt_deg, seed=1, motion=None, **changes):
@@ -43,3 +43,13 @@ def test_a_leaning_map_is_named_with_what_to_write():
 
 def test_before_one_heading_it_may_be_the_accelerometer():
     assert flown(4.0, motion=Motion.still()).doubts == []
+
+
+def test_the_present_map_is_named_not_the_one_before_its_correction():
+    """In flight a levelled map is loaded, whose axes are turned by a right angle, too."""
+    ekf, level = flown(4.0), so3_exp([-np.radians(4.0), 0.0, 0.0])
+    turned = so3_exp([0.0, 0.0, np.pi / 2.0])
+    ekf.move_map(transform(turned @ level, np.zeros(3)))
+    assert ekf.doubts == []
+    ekf.move_map(transform(turned @ level.T @ turned.T, np.zeros(3)))
+    assert [doubt.words for doubt in ekf.doubts] == ['the map leans']
