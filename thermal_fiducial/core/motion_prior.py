@@ -22,6 +22,9 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Fastest component of a twist [m/s, rad/s]: no camera that sees markers moves like this, a filter that diverges does.
 FASTEST = 50.0
+#: Of a position that is known this badly [m] nothing follows for a frame: a hundred times what a filter calls lost. Its
+#: velocity may be beyond all bounds by then.
+LOST_M = 30.0
 #: Longest time [s] over which the mapper extrapolates an odometry state to a frame.
 MAX_AGE = 0.3
 # A stamp farther back [ns] is not of a message that was overtaken: the clock was set, and all before is of another one.
@@ -33,10 +36,11 @@ _MOST = 2000
 
 
 def plausible(states: Sequence[Odometry]) -> list[Odometry]:
-    """The states with a twist below ``FASTEST``."""
+    """The states with a twist below ``FASTEST`` of a filter that has not been lost for long."""
     twists = np.array([(state.velocity_body, state.angular_velocity_body) for state in states]).reshape(-1, 6)
-    slow = (np.abs(twists) < FASTEST).all(axis=1)
-    return [state for state, usable in zip(states, slow.tolist(), strict=True) if usable]
+    variances = np.array([state.pose_covariance.diagonal()[:3] for state in states]).reshape(-1, 3)
+    usable = (np.abs(twists) < FASTEST).all(axis=1) & (variances < LOST_M**2).all(axis=1)
+    return [state for state, chosen in zip(states, usable.tolist(), strict=True) if chosen]
 
 
 class MotionPrior:

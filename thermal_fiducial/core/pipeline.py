@@ -134,8 +134,8 @@ class Pipeline:
         update = None
         if (pose := mapping.pose) is not None:
             update = self.filter.add_pose(replace(pose, T_map_camera=as_published(pose.T_map_camera)))
-        if (offset := self.filter.camera_time_offset) is not None:
-            self._odometry.set_clock_offset(offset)
+            if (offset := self.filter.camera_time_offset) is not None:
+                self._odometry.set_clock_offset(offset)
         refined = self.mapper.refinement_due(stamp_ns) and self.mapper.refine(VIEWS) is not None
         if refined or mapping.map_changed:
             self._share_map()

@@ -45,6 +45,12 @@ def test_what_no_camera_that_sees_markers_can_do_is_left_out(name, speed):
     assert log.nearest(PERIOD_NS) is None
 
 
+def test_a_filter_that_has_been_lost_for_long_says_nothing():
+    """As where messages are read."""
+    lost = replace(STATE, pose_covariance=np.diag([1.0, 901.0, 1.0, 1.0, 1.0, 1.0]))
+    assert motion_prior(lost).nearest(0) is None
+
+
 def test_many_are_thinned_out_evenly():
     assert stamps(motion_prior(*states(19)).between(0, 10**9, 10)) == [2 * k * PERIOD_NS for k in range(10)]
     uneven = stamps(motion_prior(*states(12)).between(0, 10**9, 10))

@@ -15,7 +15,7 @@ from rclpy.serialization import deserialize_message
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
-from thermal_fiducial.core.motion_prior import FASTEST
+from thermal_fiducial.core.motion_prior import FASTEST, LOST_M
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import records
@@ -29,9 +29,8 @@ BEHIND_STAMP = _HEADER + _STAMP.size
 _SIZES, _ROWS = struct.Struct('<III'), struct.Struct('<II')
 # Position, quaternion, pose covariance; velocity, angular velocity, twist covariance.
 _POSE, _ODOMETRY = 7 + 36, 7 + 36 + 6 + 36
-# Where the variances of the position are in these. Of a position that is known this badly [m] nothing follows for a
-# frame: a hundred times what a filter calls lost. Its velocity may be beyond all bounds by then.
-_VARIANCES, _LOST_M = [7, 14, 21], 30.0
+# Where the variances of the position are in these.
+_VARIANCES = [7, 14, 21]
 # Orientation, angular velocity, specific force, each with its covariance.
 _IMU = 4 + 9 + 3 + 9 + 3 + 9
 # Longest message accepted [bytes], since hundreds are kept: the numbers take 712, the rest are names of frames.
@@ -81,7 +80,7 @@ def odometry(messages: Sequence[bytes]) -> list[Odometry]:
     numbers = np.stack([_numbers(message, 2, _ODOMETRY, 'odometry') for message in messages]).astype(np.float64)
     covariances = np.stack([numbers[:, 7:43], numbers[:, 49:]], axis=1).reshape(-1, 2, 6, 6)
     covariances = checked_covariance(covariances, 'odometry with a covariance')
-    known = np.flatnonzero(np.all(numbers[:, _VARIANCES] < _LOST_M**2, axis=1))
+    known = np.flatnonzero(np.all(numbers[:, _VARIANCES] < LOST_M**2, axis=1))
     if not len(known):
         return []
     stamps, numbers, covariances = [stamps[index] for index in known], numbers[known], covariances[known]
