@@ -115,7 +115,7 @@ MECHANISMS = {
         {'history:relinearises': lambda *_: False},
     ),
     'second Gauss-Newton step': Mechanism(
-        ('poorly mapped markers',),
+        ('returning',),
         ('update:_iterated',),
         {'update:_iterated': lambda innovation, gain: gain @ innovation.value},
     ),

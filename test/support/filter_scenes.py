@@ -398,12 +398,18 @@ def shaken_start(seed: int) -> Arrivals:
     return _arrivals(flight, flight.poses)
 
 
+def returning(seed: int) -> Arrivals:
+    """A single marker after 25 s without any."""
+    flight = Flight(seed=seed, seconds=34.0)
+    return _arrivals(flight, flight.poses, gaps=((6.0, 31.0),))
+
+
 def _scenes() -> dict[str, Scene]:
     flights = (
         brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, starved,
         jittering, tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start, stepping_clock,
         small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making, shaking_mount, poorly_mapped_markers,
-        shaken_start,
+        shaken_start, returning,
     )  # fmt: skip
     scenes: dict[str, Scene] = {scene.__name__.replace('_', ' '): partial(of_flights, scene) for scene in flights}
     # The clock's error over its claim takes more of them.
