@@ -312,14 +312,11 @@ class ImagePoints(Stacked):
         return ImagePoints(px, self.x + (self.inverse @ (px - self.px)[..., None])[..., 0], self.J, self.inverse)
 
 
-def by_other_calibration(
-    px: FloatArray, covariances: FloatArray, before: Camera, now: Camera
-) -> tuple[FloatArray, FloatArray]:
-    """Pixels (..., 2) and covariances (..., 2, 2) [px^2] ``now`` of directions by the calibration of ``before``."""
+def by_other_calibration(px: FloatArray, before: Camera, now: Camera) -> tuple[FloatArray, FloatArray]:
+    """Pixels (..., 2) ``now`` of directions by the calibration of ``before``, and their derivatives (..., 2, 2)."""
     at = ImagePoints.at(px, before)
     uv, J = now.distort_linearised(at.x)
-    gain = J @ at.inverse
-    return uv, gain @ covariances @ gain.swapaxes(-1, -2)
+    return uv, J @ at.inverse
 
 
 def _least_root(polynomial: Polynomial) -> float:

@@ -49,9 +49,9 @@ class Keyframe:
     #: whether only odometry connects it, and markers that follow, with keyframes before: never dropped
     bridge: bool = False
     #: (k, 4, 2) [px/s] what corners are displaced by each second that the readout time is declared too short by
-    rates: FloatArray = field(default_factory=lambda: np.zeros((1, 1, 1)))
+    rates: FloatArray = field(default_factory=lambda: np.zeros((1, 1, 2)))
     #: (k, 4, 2, 2) [px^2] what they may be displaced by where that velocity is not known
-    late: FloatArray = field(default_factory=lambda: np.zeros((1, 1, 1, 1)))
+    late: FloatArray = field(default_factory=lambda: np.zeros((1, 1, 2, 2)))
 
 
 def snapshot_of(
@@ -285,11 +285,17 @@ class KeyframeStore:
     def _carry_over(self, before: Camera, now: Camera) -> None:
         """Give all keyframes the pixels that their directions have by another calibration."""
         frames = list(self.frames.values())
-        px, covariances = np.concatenate([f.corners for f in frames]), np.concatenate([f.covariances for f in frames])
-        px, covariances = by_other_calibration(px, covariances, before, now)
+        px, gains = by_other_calibration(np.concatenate([frame.corners for frame in frames]), before, now)
         ends = np.cumsum([len(frame.ids) for frame in frames])[:-1]
-        for frame, corners, own in zip(frames, np.split(px, ends), np.split(covariances, ends), strict=True):
-            self.frames[frame.stamp_ns] = replace(frame, corners=corners, covariances=own)
+        for frame, corners, gain in zip(frames, np.split(px, ends), np.split(gains, ends), strict=True):
+            back = gain.swapaxes(-1, -2)
+            self.frames[frame.stamp_ns] = replace(
+                frame,
+                corners=corners,
+                covariances=gain @ frame.covariances @ back,
+                rates=(gain @ frame.rates[..., None])[..., 0],
+                late=gain @ frame.late @ back,
+            )
 
     def _selected(self, views: int) -> tuple[Keyframe, ...]:
         """Keyframes with about ``views`` views of markers at most, spread over the map like all of them."""

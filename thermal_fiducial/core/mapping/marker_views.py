@@ -111,8 +111,9 @@ class MarkerView:
 
     def in_pixels_of(self, before: Camera, now: Camera) -> 'MarkerView':
         """The same directions in pixels of the camera's calibration ``now``, where it was that of ``before``."""
-        corners, covariances = by_other_calibration(self.corners, self.corner_covariances, before, now)
-        return replace(self, corners=corners, corner_covariances=covariances)
+        corners, gains = by_other_calibration(self.corners, before, now)
+        covariances = gains @ self.corner_covariances @ gains.swapaxes(-1, -2)
+        return replace(self, corners=corners, corner_covariances=covariances, late_px=gains @ self.late_px)
 
     def moved(self, T_new_old: FloatArray) -> 'MarkerView':
         """The same view in a displaced map."""

@@ -59,11 +59,12 @@ def test_of_two_views_from_one_direction_one_that_is_known_far_better_is_kept(co
 def test_views_of_another_calibration_keep_their_directions():
     """A camera that is calibrated anew in flight, to another size of the image: the pixels of before mean others."""
     half = replace(CAMERA, width=CAMERA.width // 2, height=CAMERA.height // 2, K=CAMERA.K * [[0.51], [0.49], [1.0]])
-    before = view(0, np.eye(4))
+    before = replace(view(0, np.eye(4)), late_px=np.ones((4, 2, LATE)))
     found = before.in_pixels_of(CAMERA, half)
     np.testing.assert_allclose(half.normalise(found.corners), CAMERA.normalise(before.corners), atol=1e-9)
     # In the middle of the image, where the lens hardly distorts: half a pixel of one is a pixel of the other.
     np.testing.assert_allclose(found.corner_covariances, 0.25 * before.corner_covariances, rtol=0.1, atol=1e-6)
+    np.testing.assert_allclose(found.late_px, 0.5 * before.late_px, rtol=0.1)
 
 
 @pytest.mark.parametrize('change', [1.0, 1.025])

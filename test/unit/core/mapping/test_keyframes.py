@@ -4,11 +4,12 @@ from dataclasses import replace
 import time
 
 import numpy as np
-from support.walls import flight
+from support.walls import CAMERA, flight
 
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.measurements import CameraPose, LATE, Observations
 
 
 def frame(stamp, T):
@@ -126,3 +127,22 @@ def test_rotations_stay_rotations_however_often_the_map_moves():
         moved, markers = store.move({}, markers, after), after
         R = np.stack([f.T_map_camera[:3, :3] for f in store.frames.values()] + [moved.at(3)[:3, :3]])
         np.testing.assert_allclose(np.swapaxes(R, -1, -2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
+
+
+def test_what_displaces_late_rows_keeps_its_direction_where_the_calibration_changes():
+    """A camera that is calibrated anew in flight, to half the size: a pixel of before is half a pixel now."""
+    half = replace(CAMERA, width=CAMERA.width // 2, height=CAMERA.height // 2, K=CAMERA.K * [[0.5], [0.5], [1.0]])
+    late = np.zeros((2, 4, 2, LATE))
+    # How fast the corners move in the image is known of the first marker only.
+    late[0, ..., 0] = late[1, ..., 1] = 3.0
+    px, noise, rates = np.full((2, 4, 2), 200.0), np.tile(0.01 * np.eye(2), (2, 4, 1, 1)), np.full((2, 4, 2), 200.0)
+    branches, by_readout = np.tile(np.eye(4), (2, 2, 1, 1)), np.zeros((2, 4, 2, 6))
+    observed = Observations(np.array([1, 2]), px, noise, np.zeros(2), branches, by_readout, rates, late)
+    store = KeyframeStore(10, MarkerMap())
+    for stamp, camera in enumerate((CAMERA, half)):
+        store.keep(observed, CameraPose(stamp, np.eye(4), np.eye(6)), camera, None)
+    before, after = store.frames[1], store.frames[0]
+    np.testing.assert_allclose(after.rates, 0.5 * before.rates, rtol=1e-9)
+    np.testing.assert_allclose(after.late, 0.25 * before.late, rtol=1e-9)
+    assert before.rates[0].all()
+    assert before.late[1].all()
