@@ -16,11 +16,11 @@ from thermal_fiducial.core.geometry.se3 import retract
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
 _MAX_STEPS = 20
-# Costs are chi-squares. The last step of a pose is one that lowers its cost by less than _LITTLE, a tenth of a
-# standard deviation; its own error is of second order. A pose whose cost exceeds that of the best alternative, or
-# _REFUTED, which no correct pose reaches, ends earlier: with a gain below _LITTLE of the excess. It is given up if
-# its cost still exceeds _REFUTED and _TIMES_THE_BEST times the best together after a step.
-_LITTLE, _REFUTED, _TIMES_THE_BEST = 1e-2, 50.0, 10.0
+#: Costs are chi-squares. The last step of a pose is one that lowers its cost by less than _LITTLE, a tenth of a
+#: standard deviation; its own error is of second order. A pose whose cost exceeds that of the best alternative, or
+#: REFUTED, which no correct pose reaches, ends earlier: with a gain below _LITTLE of the excess. It is given up if
+#: its cost still exceeds REFUTED and TIMES_THE_BEST times the best together after a step.
+_LITTLE, REFUTED, TIMES_THE_BEST = 1e-2, 50.0, 10.0
 #: Damping of Levenberg-Marquardt: factors after a step that lowers the cost, and after one that does not; largest
 #: damping, with which the search ends. The search begins with its inverse.
 EASED, MOST_DAMPED = 0.1, 1e6
@@ -92,8 +92,8 @@ def minimise(
         best = np.repeat(cost.reshape(-1, alternatives).min(axis=1), alternatives)
         gain = (step * gradient).sum(axis=1)
         left_share = np.minimum((step[:, 3:] * step[:, 3:]).sum(axis=1) / linear_angle**2, 1.0)
-        last = gain * left_share < _LITTLE * np.maximum(cost - np.minimum(best, _REFUTED), 1.0)
-        most = _REFUTED + _TIMES_THE_BEST * best
+        last = gain * left_share < _LITTLE * np.maximum(cost - np.minimum(best, REFUTED), 1.0)
+        most = REFUTED + TIMES_THE_BEST * best
         if steps > 0:
             active = active & (damping <= MOST_DAMPED) & (cost <= most)
         last |= cost - gain > most

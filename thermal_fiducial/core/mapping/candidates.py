@@ -102,15 +102,16 @@ class Candidate:
         """All poses (4, 4) that a fit to the views ends in, the best first."""
         fits = MarkerViews(self.views, self.size, camera, SystematicErrors()).fit(self._starts)
         poses = list[FloatArray]()
-        for T in fits.T[np.isfinite(fits.chi2)]:
+        for T in fits.T[np.isfinite(fits.cost)]:
             if all(turn_between(T, other) > SAME_POSE for other in poses):
                 poses.append(T)
         return poses
 
     @property
     def _starts(self) -> FloatArray:
-        """Initial poses (S, 4, 4) of a fit: from every branch of two views far apart."""
-        pairs = [view.viewpoint.poses[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
+        """Initial poses (S, 4, 4) of a fit: from every branch of the views whose cameras are known best."""
+        best = sorted(self.views, key=lambda view: view.viewpoint.turn_std)[:MIN_VIEWS]
+        pairs = [view.viewpoint.poses[:, None] @ view.branches for view in best]
         starts = np.concatenate([pair.reshape(-1, 4, 4) for pair in pairs])
         return np.asarray(starts[np.all(np.isfinite(starts), axis=(1, 2))])
 

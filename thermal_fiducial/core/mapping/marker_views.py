@@ -18,10 +18,18 @@ from thermal_fiducial.core.error_model import (
     SystematicErrors,
     with_corner_errors,
 )
-from thermal_fiducial.core.geometry.camera import by_other_calibration, Camera
-from thermal_fiducial.core.geometry.reprojection import linearise, marker_corners
-from thermal_fiducial.core.geometry.rigid_fit import minimise, Quadratic, SINGULAR
-from thermal_fiducial.core.geometry.se3 import rotation_angle, screwed
+from thermal_fiducial.core.geometry.camera import by_other_calibration, Camera, ImagePoints
+from thermal_fiducial.core.geometry.reprojection import marker_corners
+from thermal_fiducial.core.geometry.rigid_fit import (
+    Images,
+    linearised,
+    minimise,
+    Quadratic,
+    REFUTED,
+    SINGULAR,
+    TIMES_THE_BEST,
+)
+from thermal_fiducial.core.geometry.se3 import inverse, lever_arm, rotation_angle, screwed
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.measurements import LATE
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked, TINY
@@ -34,12 +42,8 @@ SAME_POSE = np.deg2rad(2.0)
 _STEEPEST = 1e6
 # A corner whose place in the image is known worse than this is known nowhere; a covariance with it has no root [px^2].
 _WIDEST = 1e12
-# How often a fit may change its mind about the cameras' poses.
-_CHOICES = 4
 # How many standard deviations of a camera's pose the likeliest one may be away.
 _FARTHEST = 6.0
-# Fits that come as near to each other as this [rad], by the same cameras, go on as one.
-_SAME_FIT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -129,13 +133,18 @@ class ViewWeights(Stacked):
     T_map_camera: FloatArray
     #: (S, n, 8) part of the residuals by the displacement of each camera to there [px]
     displaced: FloatArray
-    #: (S, n, 8, 8) by which residuals become unit white
-    W: FloatArray
+    #: (S, n, 8, 8) covariances of the residuals [px^2]
+    covariances: FloatArray
     #: (S, n) chi square of each camera's own pose, and with that of the view's residuals; infinite if that cannot be
     of_cameras: FloatArray
     costs: FloatArray
     #: (S, n, 6) displacement of each camera from the pose that is known to where it is likeliest now
     likeliest: FloatArray
+
+    @property
+    def W(self) -> FloatArray:
+        """(S, n, 8, 8) by which residuals become unit white."""
+        return np.linalg.inv(np.linalg.cholesky(self.covariances))
 
 
 @dataclass(frozen=True)
@@ -156,9 +165,10 @@ class MarkerViews:
     """n views of one marker as arrays."""
 
     def __init__(self, views: Sequence[MarkerView], size: float, camera: Camera, errors: SystematicErrors) -> None:
-        self._camera, self._size, self._side_std = camera, size, errors.marker_size_std
+        self._marker_corners, self._side_std = marker_corners(size), errors.marker_size_std
         corners = np.stack([view.corners for view in views])
-        self._corners, self._of_lens = corners.reshape(-1, 8), LensErrors(corners, camera, errors)
+        points, self._of_lens = ImagePoints.at(corners, camera), LensErrors(corners, camera, errors)
+        self._images = Images.of(points, np.broadcast_to(np.eye(2), points.J.shape))
         covariances = np.stack([view.corner_covariances for view in views])
         self._noise = block_diagonal(covariances)
         self._late = np.stack([view.late_px for view in views]).reshape(-1, 8, LATE)
@@ -174,26 +184,24 @@ class MarkerViews:
         self._best = int(np.argmin(np.sum(np.square(self._draws), axis=(1, 2, 3))))
         best = self._draws[self._best, :, None, None]
         self._covariances = self._camera_noise + covariance_by_draws(self._draws - best)
-        self._poses = max(len(view.viewpoint.poses) for view in views)
+        poses = [len(view.viewpoint.poses) for view in views]
+        self._poses, self._poses_of_best = max(poses), poses[self._best]
         self._chi2_of_cameras = np.stack([view.viewpoint.chi2 for view in views])
 
     def fit(self, starts: FloatArray) -> FittedPoses:
         """Fits from all initial poses (S, 4, 4); of two possible camera poses the likelier one is used.
 
-        At least twice: with weights from a start some degrees off, a camera's turn that nothing shows counts in part.
+        Twice: with weights from a start some degrees off, a camera's turn that nothing shows counts in part. What is
+        hopeless after the first time is no alternative.
         """
-        T, chosen, moved = starts, *self._choose_all(starts)
-        for attempt in range(_CHOICES):
-            kept = _distinct(T, chosen)
-            T, used, moved = T[kept], chosen[kept], moved[:, kept]
-            begun = self._weights(T, used, used[:, [self._best]], _of(used, moved))
-            T, chi2 = self._minimised(T, begun)
-            chosen, moved, _ = self._choose(T, used[:, [self._best]], moved)
-            if attempt and np.array_equal(used, chosen):
-                break
-        cost = chi2 + np.sum(begun.of_cameras, axis=-1)
+        chosen, moved = self._choose_all(starts)
+        T, _, cost, _ = self._fitted(starts, chosen, moved)
+        kept = _distinct(T, chosen) & (cost <= REFUTED + TIMES_THE_BEST * cost.min())
+        T, of_best = T[kept], chosen[kept][:, [self._best]]
+        chosen, moved, _ = self._choose(T, of_best, moved[:, kept])
+        T, chi2, cost, weights = self._fitted(T, chosen, moved)
         order = np.argsort(cost, kind='stable')
-        return FittedPoses(T[order], chi2[order], cost[order], used[order[0]], begun.only(order[0]))
+        return FittedPoses(T[order], chi2[order], cost[order], chosen[order[0]], weights.only(order[0]))
 
     def errors(self, fits: FittedPoses, noise: float, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Covariance (6, 6) of the best fit, and joint draws (6, K) of its error but for the sides.
@@ -226,7 +234,7 @@ class MarkerViews:
         that of this marker, and those of the markers that the cameras are known by.
         """
         r, _, J_marker = self._at_best(fits)
-        from_centre = marker_corners(self._size) @ fits.T[0, :3, :3].T
+        from_centre = self._marker_corners @ fits.T[0, :3, :3].T
         by_side = np.einsum('vcij,cj->vci', J_marker[..., :3].reshape(-1, 4, 2, 3), from_centre).reshape(-1, 8)
         white = (fits.weights.W @ np.concatenate([J_marker, by_side[..., None], r[..., None]], axis=-1)).reshape(-1, 8)
         # What a pose may explain of side and residuals says nothing of the side.
@@ -241,14 +249,13 @@ class MarkerViews:
 
     def _choose_all(self, T: FloatArray) -> tuple[IntArray, FloatArray]:
         """As :meth:`_choose`, for the likelier pose of the best camera too."""
-        moved = np.zeros((self._poses, len(T), len(self._corners), 6))
-        choices = [self._choose(T, np.full((len(T), 1), k), moved) for k in range(self._poses)]
-        of_each = np.argmin([costs for *_, costs in choices], axis=0), np.arange(len(T))
-        chosen, moved = np.stack([each[0] for each in choices]), np.stack([each[1] for each in choices], axis=1)
-        return chosen[of_each], moved[:, *of_each]
+        each, unmoved = np.arange(len(T)), np.zeros((self._poses, len(T), len(self._noise), 6))
+        chosen, moved, costs = self._choose(T, np.arange(self._poses_of_best)[:, None, None, None], unmoved)
+        likelier = np.argmin(costs, axis=0)
+        return chosen[likelier, each], np.swapaxes(moved[likelier, :, each], 0, 1)
 
     def _choose(self, T: FloatArray, of_best: IntArray, moved: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
-        """The likelier of P poses of each camera for a marker at T, beside that ``of_best`` (S, 1) of the best camera.
+        """The likelier of P poses of each camera for markers at T, beside that ``of_best`` (..., S, 1) of the best one.
 
         Parameters
         ----------
@@ -256,14 +263,13 @@ class MarkerViews:
 
         Returns
         -------
-        Which one, (S, n), the displacements as known now, and the costs (S,).
+        Which one, (..., S, n), the displacements as known now (..., P, S, n, 6), and the costs (..., S).
         """
         poses = np.arange(len(moved))[:, None, None] + np.zeros(moved.shape[1:3], dtype=np.int64)
-        weights = [self._weights(T, chosen, of_best, own) for chosen, own in zip(poses, moved, strict=True)]
-        costs = np.stack([each.costs for each in weights])
+        weights = self._weights(T, poses, of_best, moved)
         excluded = (poses != of_best) & (np.arange(poses.shape[-1]) == self._best)
-        costs = np.where(np.isfinite(costs) & ~excluded, costs, np.inf)
-        return np.argmin(costs, axis=0), np.stack([each.likeliest for each in weights]), costs.min(axis=0).sum(axis=-1)
+        costs = np.where(np.isfinite(weights.costs) & ~excluded, weights.costs, np.inf)
+        return np.argmin(costs, axis=-3), weights.likeliest, costs.min(axis=-3).sum(axis=-1)
 
     def _at_best(self, fits: FittedPoses) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of the best fit: residuals (n, 8) [px], and derivatives (n, 8, 6) by the cameras and by the marker."""
@@ -271,12 +277,20 @@ class MarkerViews:
         return r[0] + fits.weights.displaced, J_camera[0], J_marker[0]
 
     def _linearised(self, T: FloatArray, T_map_camera: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Residuals (S, n, 8) [px] of markers at T, and derivatives (S, n, 8, 6) by the cameras and by the marker."""
-        shape = *T_map_camera.shape[:2], 8
-        T_map_marker = np.broadcast_to(T[:, None], T_map_camera.shape).reshape(-1, 4, 4)
-        sizes = np.full(len(T_map_marker), self._size)
-        uv, J_camera, J_marker = linearise(self._camera, T_map_camera.reshape(-1, 4, 4), T_map_marker, sizes)
-        return self._corners - uv.reshape(shape), J_camera.reshape(*shape, 6), J_marker.reshape(*shape, 6)
+        """Residuals (..., S, n, 8) [px] of markers at T, and derivatives (..., 8, 6) by the cameras and by the markers.
+
+        Residuals are NaN where a corner is behind the camera.
+        """
+        shape = T_map_camera.shape[:-2]
+        T_camera_map, count = inverse(T_map_camera), np.prod(shape[:-1], dtype=int)
+        images = Images(np.tile(self._images.whitening, (count, 1, 1, 1)), np.tile(self._images.target, (count, 1, 1)))
+        off, J, seen = linearised((T_camera_map @ T[:, None]).reshape(-1, 4, 4), self._marker_corners[None], images)
+        r = np.where(seen[:, None], -off.reshape(-1, 8), np.nan)
+        # From the axes of the cameras to those of the map.
+        J_marker = (J.reshape(*shape, 16, 3) @ T_camera_map[..., :3, :3]).reshape(*shape, 8, 6)
+        # Moved like the marker, but the other way round.
+        J_camera = -J_marker @ lever_arm(T[:, None, :3, 3] - T_map_camera[..., :3, 3])
+        return r.reshape(*shape, 8), J_camera, J_marker
 
     def _weights(self, T: FloatArray, chosen: IntArray, of_best: IntArray, moved: FloatArray) -> ViewWeights:
         """Weights of the views of markers at T (S, 4, 4) from the chosen (S, n) and (S, 1) of the cameras' poses.
@@ -286,35 +300,43 @@ class MarkerViews:
         by its view, which is ``moved`` (S, n, 6) from the one that is known (B. Bell, F. Cathey, IEEE TAC 1993): a turn
         by 10 degrees about a marker 10 m away is 0.15 m off to first order.
         """
-        own = np.arange(chosen.shape[1]), chosen
+        own = np.arange(chosen.shape[-1]), chosen
         covariances = self._covariances[of_best, *own]
         T_map_camera = screwed(self._T_map_camera[own], moved)
         r, J_camera, _ = self._linearised(T, T_map_camera)
         J_camera, by_camera, possible = _by_cameras(J_camera, covariances)
         displaced = (J_camera @ moved[..., None])[..., 0]
-        W = np.linalg.inv(np.linalg.cholesky(by_camera + self._uncertain))
-        white = W @ (r + displaced)[..., None]
-        pulls = np.swapaxes(W, -1, -2) @ white
+        r, total = (r + displaced)[..., None], by_camera + self._uncertain
+        pulls = np.linalg.solve(total, r)
         sigmas = np.sqrt(np.maximum(np.swapaxes(pulls, -1, -2) @ by_camera @ pulls, TINY))[..., 0]
         likeliest = (covariances @ np.swapaxes(J_camera, -1, -2) @ pulls)[..., 0] * np.minimum(1.0, _FARTHEST / sigmas)
         of_cameras = np.where(possible, self._chi2_of_cameras[own], np.inf)
-        costs = np.sum(white * white, axis=(-1, -2)) + of_cameras
-        return ViewWeights(T_map_camera, displaced, W, of_cameras, costs, likeliest)
+        costs = np.sum(r * pulls, axis=(-1, -2)) + of_cameras
+        return ViewWeights(T_map_camera, displaced, total, of_cameras, costs, likeliest)
 
-    def _minimised(self, T: FloatArray, begun: ViewWeights) -> tuple[FloatArray, FloatArray]:
-        """Poses (S, 4, 4) from starts, and their chi squares (S,), inf where there is none."""
+    def _fitted(
+        self, starts: FloatArray, chosen: IntArray, moved: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, ViewWeights]:
+        """Poses (S, 4, 4) from starts by the ``chosen`` poses of the cameras, with weights at the starts.
+
+        Returns
+        -------
+        Poses, chi squares (S,) of their residuals and with those of the cameras, infinite without a pose, and weights.
+        """
+        own = np.take_along_axis(moved, chosen[None, ..., None], axis=0)[0]
+        begun = self._weights(starts, chosen, chosen[:, [self._best]], own)
+        W = begun.W
 
         def evaluated(T: FloatArray) -> Quadratic:
             r, _, J = self._linearised(T, begun.T_map_camera)
-            r, J = begun.W @ (r + begun.displaced)[..., None], begun.W @ J
+            r, J = W @ (r + begun.displaced)[..., None], W @ J
             r, J = r.reshape(len(T), -1, 1), J.reshape(len(T), -1, 6)
             J_transposed, chi2 = np.swapaxes(J, -1, -2), np.sum(r * r, axis=(1, 2))
             # Residuals are measured minus predicted: the gradient is that of their squares.
             return np.where(np.isfinite(chi2), chi2, np.inf), -(J_transposed @ r)[..., 0], J_transposed @ J
 
-        possible = np.all(np.isfinite(begun.of_cameras), axis=-1)
-        T, chi2, _ = minimise(T, evaluated, alternatives=len(T))
-        return T, np.where(possible, chi2, np.inf)
+        T, chi2, _ = minimise(starts, evaluated, alternatives=len(starts))
+        return T, chi2, chi2 + np.sum(begun.of_cameras, axis=-1), begun
 
 
 def _by_cameras(J_camera: FloatArray, covariances: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -328,18 +350,13 @@ def _by_cameras(J_camera: FloatArray, covariances: FloatArray) -> tuple[FloatArr
     possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(-1, -2))
     J_sound = np.where(possible[..., None, None], J_camera, 0.0)
     moved = J_sound @ covariances @ np.swapaxes(J_sound, -1, -2)
-    possible &= np.all(np.einsum('...ii->...i', moved) < _WIDEST, axis=-1)
+    possible = possible & np.all(np.einsum('...ii->...i', moved) < _WIDEST, axis=-1)
     sound = possible[..., None, None]
     return np.where(sound, J_sound, 0.0), np.where(sound, moved, 0.0), possible
 
 
-def _of(chosen: IntArray, moved: FloatArray) -> FloatArray:
-    """The displacements (S, n, 6) of the ``chosen`` (S, n) ones of P poses, (P, S, n, 6)."""
-    return np.asarray(np.take_along_axis(moved, chosen[None, ..., None], axis=0)[0])
-
-
 def _distinct(T: FloatArray, chosen: IntArray) -> BoolArray:
-    """Which (S,) of poses (S, 4, 4) with the ``chosen`` (S, n) poses of cameras are not nearly one before them."""
+    """Which (S,) of poses (S, 4, 4) with the ``chosen`` (S, n) poses of cameras are not the same as one before them."""
     turns = rotation_angle(np.swapaxes(T[:, None, :3, :3], -1, -2) @ T[:, :3, :3])
-    alike = (turns < _SAME_FIT) & np.all(chosen[:, None] == chosen, axis=-1)
+    alike = (turns < SAME_POSE) & np.all(chosen[:, None] == chosen, axis=-1)
     return np.asarray(np.argmax(alike, axis=1) == np.arange(len(T)))

@@ -153,6 +153,21 @@ def test_of_two_cameras_that_place_a_marker_equally_well_the_likelier_one_counts
     assert 'unsettled' in placed_by_either((0.0, 0.0))
 
 
+def test_a_place_is_found_though_the_first_camera_and_the_last_one_hardly_show_it():
+    """They are taken for turned as the second poses of the others are, and known to that angle only."""
+    turn, candidate = transform(so3_exp([0.0, 0.0, 0.2]), np.zeros(3)), Candidate(7, SIZE)
+    own = 1e-5 * np.eye(6)
+    for x in (-0.4, -0.2, 0.0, 0.2, 0.4):
+        view = seen_from(x, NO_DRAWS)
+        T = view.viewpoint.T_map_camera[0]
+        first, second = (Viewpoint.known(pose, own, NO_DRAWS) for pose in (T, turn @ T))
+        along_turn = 0.2 * lever_arm((turn @ T)[:3, 3])[:, 5]
+        vague = Viewpoint.known(turn @ T, own + np.outer(along_turn, along_turn), NO_DRAWS)
+        is_vague = abs(x) > 0.3
+        candidate.add(replace(view, viewpoint=vague if is_vague else Viewpoint.either(first, second, np.zeros(2))))
+    assert 'unsettled' in candidate.place(CAMERA, SystematicErrors(corner_px=0.0))
+
+
 def test_a_camera_is_no_likelier_for_being_known_better():
     """Of two that explain all views equally well, one is known three times less well."""
     turn, candidate = transform(so3_exp([0.0, 0.0, 0.5]), np.zeros(3)), Candidate(7, SIZE)
