@@ -165,7 +165,8 @@ class FrameCleaner:
             counts = counts >> np.uint16(self._shift)
         elif used >> bits and self._carrying < _FRAMES_WITH_CARRIES:
             self._carrying = self._carrying + 1 if _carries(sample, bits) else 0
-        return np.bitwise_and(counts, np.uint16((1 << (16 if self._carrying else bits)) - 1), dtype=np.uint16)
+        mask = np.uint16((1 << (16 if self._carrying else bits)) - 1)
+        return np.bitwise_and(counts, mask, dtype=np.uint16, order='C')
 
     def _without_telemetry(self, frame: Counts | Gray, extra: int) -> Counts | Gray:
         """Without ``extra`` rows that carry no image, from the side where the picture breaks off."""

@@ -50,6 +50,15 @@ class Camera:
         return self.cleaner.process(self.stamp_ns, counts)
 
 
+def test_frames_that_are_turned_without_a_copy_are_cleaned_too():
+    """Of a camera that is mounted upright: numpy's rot90 leaves the pixels where they are in memory."""
+    frame = noisy(scene(), np.random.default_rng(0))
+    frame[100, 50] = 12_000
+    column, row = np.argwhere(np.rot90(frame) == 12_000)[0][::-1]
+    counts = Camera(np.array([[column, row]]))(np.rot90(frame)).counts
+    assert counts.max() < 8_000
+
+
 def test_a_clean_frame_passes_untouched():
     frame = noisy(scene(), np.random.default_rng(0))
     result = Camera()(frame)
