@@ -5,7 +5,7 @@ from support.scenes import motion_prior
 
 from thermal_fiducial.core.detection.prediction.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.prediction.tracking import MeasuredCorners, MotionTrack, predict_frame
-from thermal_fiducial.core.detection.prediction.twist import Twist, twist_by_odometry
+from thermal_fiducial.core.detection.prediction.twist import Twist, twist_by_odometry, UNKNOWN_TWIST
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import interaction
@@ -77,6 +77,17 @@ def test_tracker_finds_the_twist_from_two_frames():
     # A finite step of a thirtieth of a second differs from the derivative in second order; the prior pulls a little.
     np.testing.assert_allclose(found.value, TWIST, atol=0.03)
     assert np.all(np.linalg.eigvalsh(found.covariance) > 0)
+
+
+def test_a_frame_that_lags_by_all_of_the_time_since_the_last_one_shows_no_motion():
+    """At 100 Hz, of a filter that diverges: its twist is not used, and the corners are where they were 10 ms ago."""
+    ids, depth = np.array([3]), np.ones((1, 4))
+    x = 0.1 * np.array([[[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]]])
+    markers = ExpectedMarkers(ids, x, depth, np.ones(1))
+    track = MotionTrack(np.eye(4), LAG).after(10**9, Twist(TWIST, np.eye(6)), markers)
+    found = track.correct(10**9 + round(LAG * 1e9), None, MeasuredCorners(ids, x, depth, np.full(1, 1e-4)))
+    np.testing.assert_array_equal(found.value, np.zeros(6))
+    np.testing.assert_array_equal(found.covariance, UNKNOWN_TWIST.covariance)
 
 
 def turning(stamp_ns, states, jitter_ns=0, seed=6):

@@ -102,17 +102,17 @@ class MotionTrack:
         from_ago, to_ago = dt + (self.lag if self.twist is None else 0.0), self.lag if predicted is None else 0.0
         seconds, start = from_ago - to_ago, predicted or UNKNOWN_TWIST
         x, x_before = corners.x[now], self.markers.x[before]
-        A = interaction(0.5 * (x + x_before), corners.depth[now]).reshape(-1, 6)
-        velocity = (x - x_before).reshape(-1) / seconds
-        # Jitter of both stamps scales all velocities of a frame by a common factor.
-        stretch = A @ (math.sqrt(2.0) * _JITTER_S / seconds * start.value)
-        weight = np.repeat((seconds / (1.5 * corners.noise[now])) ** 2, _COORDINATES)
+        rates = interaction(0.5 * (x + x_before), corners.depth[now]).reshape(-1, 6)
+        A, moved = seconds * rates, (x - x_before).reshape(-1)
+        # Jitter of both stamps scales all displacements of a frame by a common factor.
+        stretch = rates @ (math.sqrt(2.0) * _JITTER_S * start.value)
+        weight = np.repeat((1.5 * corners.noise[now]) ** -2.0, _COORDINATES)
         # Weighted least squares whose residuals have one common error: the Sherman-Morrison formula.
         weighted, stretched = A.T * weight, weight * stretch
         spread = weighted @ stretch
         share = spread / (1.0 + stretched @ stretch)
         information = weighted @ A - spread[:, None] * share
-        information_times_twist = weighted @ velocity - share * (stretched @ velocity)
+        information_times_twist = weighted @ moved - share * (stretched @ moved)
         middle_ago = 0.5 * (from_ago + to_ago)
         return updated(start, information, information_times_twist, middle_ago, self.lag - middle_ago)
 
