@@ -27,7 +27,9 @@ def pixel_noise(counts: Pixels) -> float:
     count = min(len(rows), len(below))
     difference = cv2.absdiff(rows[:count], below[:count])[:, ::3].ravel()
     middle = difference.size // 2
-    return max(float(np.partition(difference, middle)[middle]) * SIGMA_OF_MEDIAN / math.sqrt(2.0), 0.5)
+    # Whole numbers digit by digit, in a third of the time of a partition.
+    ordered = np.sort(difference, kind='stable') if difference.dtype.kind == 'u' else np.partition(difference, middle)
+    return max(float(ordered[middle]) * SIGMA_OF_MEDIAN / math.sqrt(2.0), 0.5)
 
 
 def with_columns_corrected(counts: Float32Array, noise: float) -> Float32Array:

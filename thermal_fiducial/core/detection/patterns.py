@@ -289,8 +289,9 @@ def _counts_between(
 
 def sampled(image: Pixels, places: Float32Array) -> Float32Array:
     """Values (Q, P) of the image at columns and rows (2, Q, P)."""
+    u, v = places
     parts = [
-        cv2.remap(image, part[0], part[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for part in np.split(places, range(MOST_AT_ONCE, places.shape[1], MOST_AT_ONCE), axis=1)
+        cv2.remap(image, u[part], v[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        for part in (slice(first, first + MOST_AT_ONCE) for first in range(0, len(u), MOST_AT_ONCE))
     ]
     return np.asarray(parts[0] if len(parts) == 1 else np.concatenate(parts), dtype=np.float32)
