@@ -6,8 +6,8 @@ contrasts. If the contrast is quadratic across the marker, with the axes of its 
 slopes across them, too.
 
 Pixels across the sides count as far as the model of a side holds. Where a gradient of temperature displaces sides, near
-pixels alone count. And where the warm surface ends within the columns, only those before its end: on a side whose white
-is darker outward the end shows.
+pixels alone count. And where the warm surface ends within the columns, or something warmer begins, only those before
+its end: it shows on a side whose white is darker or brighter outward.
 """
 
 from functools import cache
@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.core.detection.corners.corner_errors import SURFACE_FALLS
-from thermal_fiducial.core.detection.corners.segments import Segments
+from thermal_fiducial.core.detection.corners.segments import median_of, Segments, UNMEASURED
 from thermal_fiducial.core.detection.corners.sides import EdgeModel, Sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
@@ -47,8 +47,9 @@ _WHITE_BEGINS, _LEAST_WHITE = 1.2, 1.5
 _END_REACHES = 2.0
 # What the outer half of the white is darker by than the inner one at the end of the surface: more than this share of
 # the contrast, by which a heater that is weaker by half at the corners of a marker of 26 px fades in a pixel, and so
-# many standard deviations more.
-_FADES, _SURE = 0.04, 3.0
+# many standard deviations more. What it is brighter by where something warmer begins: more than a lag tail of motion
+# that is not known makes of it.
+_FADES, _SURE, _WARMER = 0.04, 3.0, 0.2
 # Least number of pixels in each half. Of so many columns, and more, every second one is looked at.
 _FEWEST_PIXELS, _MANY = 6, 12
 # What pixels are off by, in contrasts, where the model of a side does not hold: even markers leave up to 0.013.
@@ -157,7 +158,7 @@ def ending_sides(
     width: FloatArray,
     motion_px: FloatArray,
 ) -> BoolArray:
-    """Sides (N, 4) within whose columns the warm surface ends.
+    """Sides (N, 4) within whose columns the warm surface ends, or something warmer begins.
 
     Parameters
     ----------
@@ -166,16 +167,17 @@ def ending_sides(
     outward, width : (E, m) distance outside the sides up to which pixels count, and the blur [px]
     motion_px : (N,) blur by motion
     """
-    contrast, noise = segments.typical[:, 0], segments.noise.min(axis=1)
-    looked_at = (noise > (_MISFIT * contrast) ** 2) & (motion_px < _STILL_PX)
+    contrast, noise = np.repeat(segments.typical[:, 0], 4), np.repeat(segments.noise.min(axis=1), 4)
+    # Where not all of a side is measured, something much warmer is so near that fewer pixels would show that instead.
+    measured = segments.variance.reshape(width.shape) < UNMEASURED
+    looked_at: BoolArray = np.asarray(measured.all(axis=1) & np.repeat(motion_px < _STILL_PX, 4))
+    looked_at &= median_of(segments.noise.reshape(width.shape), measured)[:, 0] > (_MISFIT * contrast) ** 2
     if not looked_at.any():
-        return np.zeros((len(contrast), 4), dtype=bool)
+        return looked_at.reshape(-1, 4)
     # For each part, not for each side: numpy is slow where it repeats the few numbers of a row.
     begins = _WHITE_BEGINS * width
-    limits = np.array(
-        [begins, 0.5 * (begins + outward), np.repeat(contrast, width.size // len(contrast)).reshape(width.shape)],
-        dtype=np.float32,
-    )
+    contrasts = np.repeat(contrast, width.shape[1]).reshape(width.shape)
+    limits = np.array([begins, 0.5 * (begins + outward), contrasts], dtype=np.float32)
     step = 2 if counts.shape[1] >= _MANY else 1
     outside = -sides.distance[:, ::step]
     planes = np.empty((4, *outside.shape), dtype=np.float32)
@@ -187,10 +189,10 @@ def ending_sides(
     # Of all the white, and of its outer half. A product of matrices adds up three times as fast as a sum.
     moments = np.ones(outside[:, :, 0, 0].size, dtype=np.float32) @ planes.reshape(4, -1, modelled.value[0, 0].size)
     white, outer, white_sum, outer_sum = moments.reshape(4, *modelled.value.shape[2:]).sum(axis=2)
-    contrast, noise = np.repeat(contrast, 4), np.repeat(noise, 4)
     number = np.array([outer, white - outer])
     level = np.array([outer_sum, white_sum - outer_sum]) / np.maximum(number, 1)
     variance = noise * (1.0 / np.maximum(number, 1)).sum(axis=0)
-    darker = (level[1] - level[0]) * np.sign(contrast) > _FADES * np.abs(contrast) + _SURE * np.sqrt(variance)
+    darker, unsure = (level[1] - level[0]) * np.sign(contrast), _SURE * np.sqrt(variance)
+    ends = (darker > _FADES * np.abs(contrast) + unsure) | (-darker > _WARMER * np.abs(contrast) + unsure)
     judged = (number >= _FEWEST_PIXELS).all(axis=0) & (outward > _LEAST_WHITE * width).all(axis=1)
-    return np.asarray((darker & judged).reshape(-1, 4) & looked_at[:, None])
+    return np.asarray((ends & judged & looked_at).reshape(-1, 4))
