@@ -14,6 +14,7 @@ from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import Counts, FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.images import image_to_array, PICTURE_SUFFIXES, pictures_in, stamp_to_ns
 from thermal_fiducial.files.reading import naming
@@ -116,6 +117,25 @@ def recorded_camera(bag: BagReader) -> Camera:
     info = next(bag.messages([CAMERA_INFO_TOPIC])).message
     with naming(bag.path):
         return camera(info)
+
+
+def camera_of(bag: BagReader, calibration: Path | None) -> Camera:
+    """Intrinsics of a file, else of the bag.
+
+    Raises
+    ------
+    InputError
+        There are none, or the images of the bag have another size.
+    """
+    if calibration is None:
+        return recorded_camera(bag)
+    given = load_camera(calibration)
+    if CAMERA_INFO_TOPIC in bag.topics:
+        there = recorded_camera(bag)
+        if (there.width, there.height) != (given.width, given.height):
+            sizes = f'{given.width}x{given.height} pixels, the bag of {there.width}x{there.height}'
+            raise InputError(f'{calibration}: a calibration of {sizes}')
+    return given
 
 
 def imu_track(bag: BagReader) -> tuple[ImuTrack, int]:

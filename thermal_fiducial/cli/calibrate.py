@@ -1,4 +1,4 @@
-"""``calibrate``: intrinsics of the thermal camera, camera against IMU, and noise of the IMU."""
+"""``calibrate``: intrinsics and lag of the thermal camera, camera against IMU, and noise of the IMU."""
 
 import argparse
 from collections.abc import Iterable, Iterator
@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermal_fiducial.calibration.sources import clean_frames, imu_track, recorded_camera
+from thermal_fiducial.calibration.sources import camera_of, clean_frames, imu_track
 from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.arguments import add_force, add_remap, file_to_write, refuse_to_overwrite, warn
 from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import LEAST_ORIENTATION_STD, mapped_detector
+from thermal_fiducial.cli.calibrate_lag import add_lag
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import tracked
@@ -25,8 +26,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, Markers
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, parse_remaps
-from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.reading import naming
 from thermal_fiducial.files.writing import write_text
@@ -45,6 +45,7 @@ def add_arguments(parser: Parser) -> None:
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
     what = 'intrinsics (camera_info) from thermal views of a board'
     calibrate_intrinsics.add_arguments(add_command(commands, 'intrinsics', what))
+    add_lag(add_command(commands, 'lag', 'time constant of the bolometers'))
     _add_camera_imu(add_command(commands, 'camera-imu', 'pose and clock of the camera relative to the IMU'))
     add_imu(add_command(commands, 'imu', 'noise densities of an IMU at rest'))
 
@@ -103,7 +104,7 @@ def _camera_imu(args: argparse.Namespace) -> int:
     )
     marker_map = load_map(args.map)
     with BagReader(args.bag, parse_remaps(args.remap)) as bag:
-        camera = _camera_of(bag, args.calibration)
+        camera = camera_of(bag, args.calibration)
         imu, start_ns = imu_track(bag)
         detector = mapped_detector(marker_map, args.map.parent, args.plate_thickness)
         if args.plate_thickness and has_corners_only(bag):
@@ -118,19 +119,6 @@ def _camera_imu(args: argparse.Namespace) -> int:
     print(_extrinsics_text(result))
     _warn_of_wide(*_extrinsics_std(result))
     return 0
-
-
-def _camera_of(bag: BagReader, calibration: Path | None) -> Camera:
-    """Camera of a file, else of the bag; both have images of one size."""
-    if calibration is None:
-        return recorded_camera(bag)
-    camera = load_camera(calibration)
-    if CAMERA_INFO_TOPIC in bag.topics:
-        there = recorded_camera(bag)
-        if (there.width, there.height) != (camera.width, camera.height):
-            sizes = f'{camera.width}x{camera.height} pixels, the bag of {there.width}x{there.height}'
-            raise InputError(f'{calibration}: a calibration of {sizes}')
-    return camera
 
 
 def _detected_rows(bag: BagReader, detector: MarkerDetector, camera: Camera) -> Iterator[tuple[int, Markers]]:

@@ -50,20 +50,34 @@ _BELOW = np.array(
         for place in range(-_FARTHEST * _PLACES, _FARTHEST * _PLACES + 1)
     ]
 )
-# Ages of an exponential response in four parts, up to 0.6 time constants, up to 1.4, up to 2.8, and older: what they
-# weigh, and mean and variance in time constants. Fitted with two parts, markers in 2 to 5 px of lag were 1.1 to 2.6
-# times as far off; with three they were as with four or 10 % farther, with five or more as with four.
-_LASTS = np.array([0.6, 0.8, 1.4, 40.0])
-_BEGINS = np.cumsum(_LASTS) - _LASTS
-_WEIGHTS = np.exp(-_BEGINS) * -np.expm1(-_LASTS)
-_AGES = _BEGINS + 1.0 - _LASTS / np.expm1(_LASTS)
-_VARIANCES = 1.0 + _LASTS**2 / (np.expm1(_LASTS) * np.expm1(-_LASTS))
 # Places along a side where it is computed how the lens bends, and the weights of the corners in the nodes of the grid
 # of them, rows first. With three a side, as a parabola has, markers of 22 px are 0.1 px too large behind a lens of 72
 # degrees that shortens distances from the middle of the image by a fifth.
 _NODES = np.linspace(0.0, 1.0, 4)
 _BETWEEN_CORNERS = bilinear(*(axis.ravel() for axis in np.meshgrid(_NODES, _NODES)))
 _AT_CORNERS = [0, 3, 15, 12]
+
+
+class Ages(NamedTuple):
+    """An exponential response as a sum of Gaussians: (K,) what they weigh, mean and variance in time constants."""
+
+    weights: FloatArray
+    means: FloatArray
+    variances: FloatArray
+
+    @staticmethod
+    def lasting(*lasts: float) -> 'Ages':
+        """Of parts that last so long one after the other, in time constants."""
+        lengths = np.array(lasts)
+        begins = np.cumsum(lengths) - lengths
+        weights = np.exp(-begins) * -np.expm1(-lengths)
+        variances = 1.0 + lengths**2 / (np.expm1(lengths) * np.expm1(-lengths))
+        return Ages(weights, begins + 1.0 - lengths / np.expm1(lengths), variances)
+
+
+# Fitted with two parts, markers in 2 to 5 px of lag were 1.1 to 2.6 times as far off; with three they were as with four
+# or 10 % farther, with five or more as with four.
+_FOUR_AGES = Ages.lasting(0.6, 0.8, 1.4, 40.0)
 
 
 class PatternGrid(NamedTuple):
@@ -177,6 +191,8 @@ class PatternView(NamedTuple):
     bends: FloatArray | None = None
     #: where the gray scale ends; None: nowhere, or it does not matter
     saturation: Saturation | None = None
+    #: of the response, where it lags
+    ages: Ages = _FOUR_AGES
 
     def only(self, which: IntArray) -> 'PatternView':
         """The view of some markers."""
@@ -254,13 +270,13 @@ def blurred(
     # Where it changes across the marker, parts are stretched, the oldest and most blurred ones the most.
     stretch = to_cells @ _by_cells(view.lag, white.shape[1]) * white.shape[1]
     # Of each age all markers, as one batch.
-    later, parts = _AGES - 1.0, len(_AGES)
+    later, parts = view.ages.means - 1.0, len(view.ages.means)
     then = grid.along - (later[:, None, None] * lag.swapaxes(0, 1)[:, None]).reshape(2, -1, 1)
-    of_ages = (spread + _VARIANCES[:, None, None, None] * by_lag).reshape(-1, 2, 2)
+    of_ages = (spread + view.ages.variances[:, None, None, None] * by_lag).reshape(-1, 2, 2)
     model = _gaussian(
         then, np.tile(white, (parts, 1, 1)), grid, of_ages, np.tile(blur, parts), np.tile(of_optics, (parts, 1, 1))
     )
-    weights = _WEIGHTS.astype(np.float32)
+    weights = view.ages.weights.astype(np.float32)
     value, slopes, wider, surface = (field.reshape(*field.shape[:-2], parts, len(white), -1) for field in model)
     stretched = (stretch.astype(np.float32) @ grid.middle).swapaxes(0, 1)
     farther = (weights * later.astype(np.float32)) @ (slopes * stretched[:, None]).sum(axis=0).reshape(parts, -1)
