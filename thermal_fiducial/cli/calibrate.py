@@ -16,9 +16,9 @@ from thermal_fiducial.cli.calibrate_lag import add_lag
 from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import tracked
-from thermal_fiducial.cli.ranges import IMU_NOISE
+from thermal_fiducial.cli.ranges import IMU_NOISE, LAG_S
 from thermal_fiducial.cli.recorded_corners import has_corners_only, recorded_rows
-from thermal_fiducial.config import ImuNoise, PoseEkfConfig
+from thermal_fiducial.config import ArucoDetectorConfig, ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.error_model import READOUT_AS_DECLARED
 from thermal_fiducial.core.geometry import se3
@@ -71,6 +71,13 @@ def _add_camera_imu(parser: Parser) -> None:
         '--calibration', type=Path, metavar='FILE', help='camera_info YAML (default: the camera_info of the bag)'
     )
     add_thickness(parser)
+    parser.add_argument(
+        '--bolometer-lag',
+        type=LAG_S,
+        metavar='S',
+        help='thermal time constant of the bolometers [s], by which corners are late '
+        f'(default: {ArucoDetectorConfig.bolometer_lag})',
+    )
     parser.add_argument('--out', type=file_to_write, default=Path('extrinsics.yaml'), help='parameters to write')
     add_force(parser)
     noise = ImuNoise()
@@ -106,9 +113,12 @@ def _camera_imu(args: argparse.Namespace) -> int:
     with BagReader(args.bag, parse_remaps(args.remap)) as bag:
         camera = camera_of(bag, args.calibration)
         imu, start_ns = imu_track(bag)
-        detector = mapped_detector(marker_map, args.map.parent, args.plate_thickness)
-        if args.plate_thickness and has_corners_only(bag):
-            raise InputError(f'--plate-thickness has no effect with {args.bag}, which has corners instead of images')
+        lag = ArucoDetectorConfig.bolometer_lag if args.bolometer_lag is None else args.bolometer_lag
+        detector = mapped_detector(marker_map, args.map.parent, args.plate_thickness, lag)
+        of_images = {'--plate-thickness': args.plate_thickness > 0.0, '--bolometer-lag': args.bolometer_lag is not None}
+        for option, given in of_images.items():
+            if given and has_corners_only(bag):
+                raise InputError(f'{option} has no effect with {args.bag}, which has corners instead of images')
         found = recorded_rows(bag) if has_corners_only(bag) else _detected_rows(bag, detector, camera)
         seen = sorted(_mapped_corners(found, marker_map), key=lambda frame: frame.stamp_ns)
     if not seen:

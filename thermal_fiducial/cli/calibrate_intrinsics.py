@@ -273,10 +273,15 @@ def _place(text: str) -> tuple[int, int]:
     return column, row
 
 
-def mapped_detector(board: MarkerMap, folder: Path, thickness: float = 0.0) -> MarkerDetector:
-    """Detector with the markers of ``board``, a map in ``folder``, plates of ``thickness`` [m], as its map."""
+def mapped_detector(
+    board: MarkerMap, folder: Path, thickness: float = 0.0, lag: float = ArucoDetectorConfig.bolometer_lag
+) -> MarkerDetector:
+    """Detector with the markers of ``board``, a map in ``folder``, plates of ``thickness`` [m], as its map.
+
+    ``lag`` [s]: of the bolometers.
+    """
     dictionary = dictionary_of_map(board.dictionary, folder)
-    config = ArucoDetectorConfig(dictionary=dictionary, plate_thickness=thickness)
+    config = ArucoDetectorConfig(dictionary=dictionary, plate_thickness=thickness, bolometer_lag=lag)
     detector = MarkerDetector(config, load_dictionary(dictionary))
     detector.set_map(*places_of(board.rows()))
     return detector
