@@ -85,7 +85,7 @@ def transformed(marker_map: MarkerMap, T_new_old: FloatArray) -> MarkerMap:
 def merge(resting: MarkerMap, moving: MarkerMap) -> tuple[MarkerMap, Alignment]:
     """Both maps in the frame of ``resting``.
 
-    The covariances of ``moving`` are inflated by the misfit of the common markers. Of these the pose with the smaller
+    The covariances of ``moving`` are inflated by what the common markers leave open. Of these the pose with the smaller
     covariance is kept; the others of ``moving`` are added.
 
     Raises
@@ -98,7 +98,7 @@ def merge(resting: MarkerMap, moving: MarkerMap) -> tuple[MarkerMap, Alignment]:
     alignment = align(resting.markers, moving.markers)
     moved = transformed(moving, alignment.T).markers
     agreeing = [key for key in alignment.residuals_m if key not in alignment.outliers]
-    middle, slack = _misfit(resting, moved, agreeing, alignment)
+    middle, slack = _left_open(resting, moved, agreeing, alignment)
     changes: dict[int, MapMarker] = {}
     for key, marker in moved.items():
         own = resting.markers.get(key)
@@ -117,21 +117,28 @@ def merge(resting: MarkerMap, moving: MarkerMap) -> tuple[MarkerMap, Alignment]:
     return _changed(resting, changes), alignment
 
 
-def _misfit(
+def _left_open(
     resting: MarkerMap, moved: Mapping[int, MapMarker], common: list[int], alignment: Alignment
 ) -> tuple[FloatArray, FloatArray]:
     """Middle (3,) of the common markers, about which an alignment turns the others, and its covariance (6, 6) there.
 
-    One common marker fits exactly: it shows no misfit, and the errors of both of its poses count.
+    The errors of both poses of the common markers, whose correlations no file has: covariances times their number
+    bound those of the sum for any. What the misfit has beyond these errors is added.
     """
     markers = [moved[key] for key in common]
     corners = corners_of_markers(markers)
     middle = corners.mean(axis=(0, 1))
-    if len(common) == 1:
-        return middle, markers[0].covariance + resting.markers[common[0]].covariance
-    mean_square = float(np.mean(np.square([alignment.residuals_m[key] for key in common])))
+    covariances = np.stack([marker.covariance + resting.markers[marker.id].covariance for marker in markers])
+    centres = np.stack([marker.T_map_marker[:3, 3] for marker in markers])
+    # Displacements of the corners by one of the alignment about the middle, and by one of their marker.
+    by_all, by_own = (lever_arm(corners - about)[..., :3, :] for about in (middle, centres[:, None]))
+    shares = np.linalg.solve(np.einsum('kcij,kcil->jl', by_all, by_all), np.einsum('kcij,kcil->kjl', by_all, by_own))
+    bound = len(common) * np.sum(shares @ covariances @ shares.swapaxes(1, 2), axis=0)
+    expected = float(np.einsum('kcij,kjl,kcil->', by_own, covariances, by_own)) / (4 * len(common))
+    misfit = float(np.mean(np.square([alignment.residuals_m[key] for key in common])))
+    beyond = max(misfit - expected, 0.0)
     spread = float(np.mean(np.sum((corners - middle) ** 2, axis=-1)))
-    return middle, np.diag([mean_square / 3.0] * 3 + [mean_square / spread] * 3)
+    return middle, bound + np.diag([beyond / 3.0] * 3 + [beyond / spread] * 3)
 
 
 def marker_of(marker_map: MarkerMap, marker_id: int) -> MapMarker:

@@ -16,7 +16,7 @@ from thermal_fiducial.cli.main import main
 from thermal_fiducial.cli.map_plot import draw_map
 from thermal_fiducial.cli.run_parameters import camera_of_run
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
-from thermal_fiducial.core.geometry.se3 import apply, difference, inverse, retract, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import apply, difference, inverse, lever_arm, retract, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.files.camera_info import save_camera
@@ -317,7 +317,7 @@ def test_a_survey_that_does_not_settle_the_frame_is_refused(path, survey, words,
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize('common', [1, 3])
+@pytest.mark.parametrize('common', [1, 2, 3])
 def test_a_merged_marker_claims_what_the_common_ones_leave_open(common):
     """Ten metres beside them: what they are turned by moves it most."""
     poses, stds = wall(np.random.default_rng(0)), np.repeat((0.003, 0.01), 3)
@@ -337,8 +337,32 @@ def test_a_merged_marker_claims_what_the_common_ones_leave_open(common):
         added = merge(*maps)[0].markers[9]
         d = difference(added.T_map_marker, places[9])
         squares.append(d @ np.linalg.solve(added.covariance, d))
-    # Misfits of three markers scatter by a third; without the way to the marker it is 15.
+    # Claims bound errors that may be correlated, these are not; without the way to the marker it is 15.
     assert 0.4 < np.mean(squares) / 6.0 < 1.5
+
+
+@pytest.mark.parametrize('common', [2, 3])
+def test_a_merged_marker_is_known_no_better_than_what_the_common_ones_share(common):
+    """Twenty metres from the anchor of their map they are turned about it together, which shows in no misfit."""
+    poses, own, turn = wall(np.random.default_rng(0)), np.repeat((0.001, 0.0005), 3), 0.001
+    away = np.array([0.0, 20.0, 0.0, 0.0, 0.0, 0.0])
+    places = {key: retract(poses[key], away) for key in [*range(common), common]}
+    squares = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        shared, maps = turn * rng.normal(size=3), []
+        for of_all, ids in ((1.0, range(common)), (0.0, places)):
+            markers = {}
+            for key in ids:
+                arm = of_all * lever_arm(places[key][:3, 3])[:, 3:]
+                off = retract(places[key], arm @ shared + own * rng.normal(size=6))
+                markers[key] = MapMarker(key, SIZE, False, off, turn**2 * arm @ arm.T + np.diag(own**2))
+            maps.append(MarkerMap(markers))
+        added = merge(*maps)[0].markers[common]
+        d = difference(added.T_map_marker, places[common])
+        squares.append(d @ np.linalg.solve(added.covariance, d))
+    # By their misfit alone 50 to 70.
+    assert 0.2 < np.mean(squares) / 6.0 < 1.5
 
 
 @pytest.mark.parametrize('common', [1, 3])
