@@ -19,6 +19,7 @@ from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.map_tools.map_doubts import LARGE_PX
 
 # Most passes over all frames: more than a chain of markers needs, each seen only together with the previous one.
 _MAX_PASSES = 50
@@ -43,7 +44,7 @@ class Built:
     frames_used: int
     #: index of each other frame, with the reason
     unused: dict[int, str] = field(default_factory=dict)
-    #: that most markers contradict the map to start from, in words; empty if they do not
+    #: that most markers contradict the map to start from, in words; empty if they do not, or agree with this one
     contradiction: str = ''
 
 
@@ -89,7 +90,8 @@ def build_map(
         mapper.apply(refinement)
     used = [rows for k, rows in enumerate(frames) if k not in unused]
     final = _with_statistics(mapper.map, used, marker_map, errors)
-    return Built(final, refinement, unplaced, len(used), unused, mapper.doubt_of_map)
+    cured = bool(errors) and float(np.median(list(errors.values()))) <= LARGE_PX
+    return Built(final, refinement, unplaced, len(used), unused, '' if cured else mapper.doubt_of_map)
 
 
 def _stamp(k: int) -> int:

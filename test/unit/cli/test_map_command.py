@@ -424,6 +424,18 @@ def test_refine_names_the_factor_of_a_map_in_another_unit(path, poses, photograp
     assert ('distances in the map are 3.28 times those seen' in capsys.readouterr().err) == (status == 2)
 
 
+def test_refine_of_a_map_by_hand_answers_for_the_map_that_it_writes(path, poses, photographed):
+    """Most markers were not where the map to start from had them, which is what the refinement cures."""
+    rng, stds = np.random.default_rng(3), np.repeat((0.15, 0.05), 3)
+    off = {key: retract(T, stds * rng.normal(size=6)) for key, T in poses.items() if key}
+    markers = {0: MapMarker(0, SIZE, True, poses[0])} | {key: MapMarker(key, SIZE, False, T) for key, T in off.items()}
+    save_map(path, MarkerMap(markers))
+    assert run('refine', path, *photographed) == 0
+    # As from one marker alone.
+    refined = load_map(path).markers
+    assert max(np.linalg.norm(difference(refined[key].T_map_marker, T)[:3]) for key, T in poses.items()) < 2e-3
+
+
 def test_refine_counts_the_frames_that_gave_nothing_by_reason(path, poses, photographed, capsys):
     save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
     lines = photographed[0].read_text().splitlines()
