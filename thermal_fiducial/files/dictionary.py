@@ -6,7 +6,7 @@ A dictionary file is YAML::
     version: 1
     name: STENCIL_4X4_20        # what parameter `dictionary` may say when the package ships the file
     marker_size: 4              # bits along one side, without the black border of one bit
-    max_correction_bits: 1      # bit errors that still name a marker
+    max_correction_bits: 1      # bit errors that still name a marker, as far as the patterns differ enough
     markers:                    # IDs 0, 1, 2 ... each its rows from the top, 1 for white (hot, cut out)
       - ['0110', '1011', '0010', '1101']
 """
@@ -187,7 +187,15 @@ def _from_document(document: Value) -> Dictionary:
     markers = fields['markers'].items()
     if not markers:
         raise fields['markers'].error('no markers')
-    return Dictionary(np.stack([_bits(rows, size) for rows in markers]), correction)
+    bits = np.stack([_bits(rows, size) for rows in markers])
+    known: dict[bytes, int] = {}
+    for index, (rows, marker) in enumerate(zip(markers, bits, strict=True)):
+        look = min(np.rot90(marker, turn).tobytes() for turn in range(4))
+        if look in known:
+            raise rows.error(f'looks like marker {known[look]}, upright or turned: neither would be detected')
+        known[look] = index
+    # What a file claims beyond this would name wrong markers.
+    return Dictionary(bits, min(correction, correctable_bits(bits)))
 
 
 def _bits(rows: Value, size: int) -> Gray:

@@ -6,7 +6,7 @@ import pytest
 from support.opencv import draw_marker
 import yaml
 
-from thermal_fiducial.core.detection.patterns import correctable_bits
+from thermal_fiducial.core.detection.patterns import correctable_bits, Dictionary
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import bring_from_map, load_dictionary, other_patterns, save_dictionary
 
@@ -55,6 +55,7 @@ GOOD = {'format': 'thermal_fiducial/dictionary', 'version': 1, 'marker_size': 2,
         ({'markers': [['01', '1']]}, r'markers\[0\]: not 2 strings'),
         ({'markers': [['01', '12']]}, r'markers\[0\]: not 2 strings'),
         ({'markers': [['01', '11'], 7]}, r'markers\[1\]'),
+        ({'markers': [['01', '11'], ['11', '10']]}, r'markers\[1\]: looks like marker 0, upright or turned'),
     ],
 )
 def test_errors_of_a_dictionary_file_name_the_fault(change, words, tmp_path):
@@ -62,6 +63,13 @@ def test_errors_of_a_dictionary_file_name_the_fault(change, words, tmp_path):
     path.write_text(yaml.safe_dump(GOOD | change))
     with pytest.raises(InputError, match=words):
         load_dictionary(path)
+
+
+def test_a_file_corrects_no_more_than_its_patterns_allow(tmp_path):
+    """Three bits or more excuse a marker from looking like its pattern: a neighbour's would do."""
+    dictionary = load_dictionary('DICT_4X4_50')
+    save_dictionary(tmp_path / 'own.yaml', 'OWN', Dictionary(dictionary.bits, 6))
+    assert load_dictionary(tmp_path / 'own.yaml').correctable == dictionary.correctable
 
 
 @pytest.mark.parametrize('name', ['DICT_4X4_51', 'getPredefinedDictionary', '/nowhere/at/all.yaml', ''])

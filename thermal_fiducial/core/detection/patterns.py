@@ -19,6 +19,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 _OUTSIDE = 0.4
 #: Largest number of rows, or of columns, of places that OpenCV interpolates at once.
 MOST_AT_ONCE = 2**15 - 2
+# Markers that are compared with all at a time: 30,000 among themselves would take gigabytes.
+_AT_A_TIME = 256
 # Correlation below which the surroundings need not be measured.
 _SIMILAR = 0.5
 #: Samples along a cell, in its middle, away from blurred edges.
@@ -60,10 +62,14 @@ def correctable_bits(bits: Gray) -> int:
     flat = bits.reshape(len(bits), -1).astype(np.float32)
     turned = np.concatenate([np.rot90(bits, turn, axes=(1, 2)).reshape(len(bits), -1) for turn in range(4)])
     turned = turned.astype(np.float32)
-    # Bits that differ: set in the one and not in the other.
-    distance = flat.sum(axis=1)[:, None] + turned.sum(axis=1) - 2.0 * flat @ turned.T
-    np.fill_diagonal(distance, np.inf)
-    return max((int(distance.min()) - 1) // 2, 0)
+    least = np.inf
+    for first in range(0, len(flat), _AT_A_TIME):
+        some = flat[first : first + _AT_A_TIME]
+        # Bits that differ: set in the one and not in the other.
+        distance = some.sum(axis=1)[:, None] + turned.sum(axis=1) - 2.0 * some @ turned.T
+        np.fill_diagonal(distance[:, first:], np.inf)
+        least = min(least, float(distance.min()))
+    return max((int(least) - 1) // 2, 0)
 
 
 def turned_alike(bits: Gray) -> BoolArray:
