@@ -17,6 +17,9 @@ OF_ALL = 10 + AXES
 #: Largest time offset that is searched [s].
 LARGEST_OFFSET = 0.15
 _COARSE_STEP = 0.002
+# Least correlation of the turns about a second axis, over the root of their number: noise alone has 1 to 3, and from 5
+# on the rotation that follows from them is right to 0.2 rad, from where the adjustment converges.
+_BEYOND_NOISE = 5.0
 
 
 @dataclass(frozen=True)
@@ -43,12 +46,11 @@ def first_state(stamps: FloatArray, measured: FloatArray, imu: ImuTrack, gravity
     steady = dt < 2.0 * np.median(dt)
     middle = 0.5 * (stamps[:-1] + stamps[1:])[steady]
     turned = turned[steady]
-    if np.min(np.std(turned, axis=0)) < 0.01:
-        raise InputError('the camera turned about fewer than three axes: neither rotation nor lever arm show in that')
     offsets = np.arange(-LARGEST_OFFSET, LARGEST_OFFSET, _COARSE_STEP)
     aligned = [_aligned(turned, imu.at(middle + offset)[0]) for offset in offsets]
     best = int(np.argmin([error for _, _, error in aligned]))
     R_body_camera, rate_bias, _ = aligned[best]
+    _require_turns(turned, imu.at(middle + offsets[best])[0])
     R_body = R @ R_body_camera.T
     _, force = imu.at(stamps + offsets[best])
     up = np.mean((R_body @ force[:, :, None])[:, :, 0], axis=0)
@@ -62,6 +64,16 @@ def _aligned(camera: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArr
     """R, b and mean squared error of body = R camera + b."""
     T = se3.rigid_alignment(body, camera)
     return T[:3, :3], T[:3, 3], float(np.mean((body - se3.apply(T, camera)) ** 2))
+
+
+def _require_turns(camera: FloatArray, body: FloatArray) -> None:
+    """Raise InputError unless turn rates (N, 3) of camera and body share two axes, by their canonical correlations."""
+    bases = [np.linalg.qr(rates - rates.mean(axis=0))[0] for rates in (camera, body)]
+    if np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[1] < _BEYOND_NOISE / np.sqrt(len(body)):
+        raise InputError(
+            'camera and IMU turn together about fewer than two axes, which shows neither rotation nor lever arm: turn '
+            f'about all three axes, with clocks that are less than {LARGEST_OFFSET:g} s apart'
+        )
 
 
 def horizontal(gravity: FloatArray) -> FloatArray:
