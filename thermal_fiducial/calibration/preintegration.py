@@ -20,6 +20,9 @@ from thermal_fiducial.errors import InputError
 _STEP = 0.005
 #: Number of scale errors and misalignments of an IMU, and of those of its gyroscope, which are the first.
 AXES, GYROSCOPE_AXES = 15, 9
+# Interval between samples [s] from which on motion is not linear in it: interpolated over 0.1 s it moves no answer by a
+# fifth of its error, over 0.2 s by all of it.
+_GAP = 0.1
 # Variance of the second difference of white noise of variance one.
 _SECOND_DIFFERENCE = 6.0
 
@@ -61,6 +64,16 @@ class ImuTrack:
             for signal in (self.rate, self.force)
         )
         return rate.reshape(*t.shape, 3), force.reshape(*t.shape, 3)
+
+    def hidden(self, t: FloatArray) -> FloatArray:
+        """Noise densities (N, 6), squared, of what samples are interpolated over at times ``t`` (N,); 0 outside gaps.
+
+        In a gap the motion may be any of the recording, one and the same all through it.
+        """
+        after = np.clip(np.searchsorted(self.seconds, t), 1, len(self.seconds) - 1)
+        apart = self.seconds[after] - self.seconds[after - 1]
+        variance = np.var(np.hstack([self.rate, self.force]), axis=0)
+        return np.asarray((apart * (apart > _GAP))[:, None] * variance)
 
     def require_signals(self) -> None:
         """Raise InputError if an axis never changes: its sensor is dead, or the driver does not fill it in."""
@@ -146,7 +159,8 @@ def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: Dens
     for step in range(int(steps.max())):
         on = np.flatnonzero(steps > step)
         h = (dt[on] / steps[on])[:, None]
-        rate, force = imu.at(times[on] + (step + 0.5) * h[:, 0])
+        t = times[on] + (step + 0.5) * h[:, 0]
+        rate, force = imu.at(t)
         axes = axis_errors(rate, force)
         rate, force = rate - bias[on, :3], force - bias[on, 3:]
         half = se3.so3_exp(0.5 * rate * h)
@@ -156,7 +170,7 @@ def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: Dens
         by_bias[on] = transition @ by_bias[on] - inputs
         by_axes[on] = transition @ by_axes[on] - inputs @ axes
         covariance[on] = transition @ covariance[on] @ np.swapaxes(transition, 1, 2)
-        covariance[on] += inputs @ ((density / h)[:, :, None] * np.swapaxes(inputs, 1, 2))
+        covariance[on] += inputs @ (((density + imu.hidden(t)) / h)[:, :, None] * np.swapaxes(inputs, 1, 2))
         a = (middle @ force[:, :, None])[:, :, 0]
         p[on] += v[on] * h + 0.5 * a * h**2
         v[on] += a * h
