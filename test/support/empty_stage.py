@@ -3,10 +3,15 @@
 from dataclasses import dataclass
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 
+from support.waiting import PATIENCE_S
 from thermal_fiducial.ros.base.node import StageNode
+
+#: Statuses of a node that was asked to stop: SIGPROF ends one that DDS does not let go of, after all is saved.
+STOPPED = {0, -signal.SIGPROF}
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -29,6 +34,11 @@ def environment():
 
 
 def finished(program, *arguments):
-    """What a Python program printed and its exit status, once it has ended."""
+    """What a Python program printed and its exit status, once it has ended.
+
+    Without lines of Fast DDS about shared memory that another process, of any domain, is just about to give up.
+    """
     command = [sys.executable, '-c', program, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=environment())
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False, env=environment())
+    done.stderr = ''.join(line for line in done.stderr.splitlines(keepends=True) if 'RTPS_TRANSPORT_SHM' not in line)
+    return done

@@ -2,14 +2,13 @@
 
 from dataclasses import replace
 import json
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rosbags.typesys import get_typestore, Stores
 from support.commands import status
+from support.empty_stage import finished
 from support.flights import Motion
 
 from thermal_fiducial.cli.check_bridge import exit_status
@@ -261,7 +260,7 @@ from thermal_fiducial.ros.watching import bridge_listener
 bridge_listener.DISCOVERY_S = 0.2
 sys.exit(main(['check-bridge', '--seconds', '0.1', '--ros-args', '-r', '__ns:=/drone', '-r', 'imu/data:=imu/raw']))
 """
-    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
+    done = finished(program)
     assert done.returncode == 1
     assert 'Listening to /drone/bridge/odometry and /drone/imu/raw for' in done.stderr
     assert 'fault  messages: 0 messages' in done.stdout
