@@ -6,6 +6,8 @@ import subprocess
 import sys
 import time
 
+from support.waiting import PATIENCE_S
+
 
 def interrupted(words, begun, after_s, times, apart_s):
     """Exit status and lines of stderr of a command that is interrupted ``times`` times.
@@ -32,5 +34,5 @@ def interrupted(words, begun, after_s, times, apart_s):
         os.killpg(process.pid, signal.SIGINT)
         time.sleep(apart_s)
     # Workers that stay would hold the pipe.
-    error = process.communicate(timeout=60)[1]
+    error = process.communicate(timeout=PATIENCE_S)[1]
     return process.returncode, error.splitlines()

@@ -16,8 +16,7 @@ from types import ModuleType, SimpleNamespace
 
 import yaml
 
-#: Longest wait for a process that was asked to stop [s]: ten times what it takes on a machine that is busy with tests.
-_PATIENCE = 30.0
+from support.waiting import PATIENCE_S
 
 
 class LaunchContext:
@@ -244,7 +243,7 @@ class Launch:
                 process.send_signal(signal.SIGINT)
             time.sleep(pause)
         try:
-            return {name: process.wait(_PATIENCE) for name, process in running.items()}
+            return {name: process.wait(PATIENCE_S) for name, process in running.items()}
         finally:
             self.kill()
 

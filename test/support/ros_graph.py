@@ -7,6 +7,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 
+from support.waiting import PATIENCE_S
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.counting import CountingNode
 from thermal_fiducial.ros.process.run import make_executor
@@ -78,8 +79,8 @@ class Graph:
         (source,) = [source for source in node.inputs if source.topic == f'/{topic}']
         return source
 
-    def spin_until(self, condition, seconds=60.0):
-        deadline = time.monotonic() + seconds
+    def spin_until(self, condition):
+        deadline = time.monotonic() + PATIENCE_S
         while not condition():
             # Short: some inputs are polled by take_waiting, and wake no executor.
             self.executor.spin_once(timeout_sec=0.002)

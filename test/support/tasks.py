@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 import time
 
+from support.waiting import until
 from thermal_fiducial.files.work_folders import work_folder
 
 
@@ -15,7 +16,7 @@ def work(task):
         os._exit(3)
     if task == 'hang up':
         os.closerange(3, 256)
-        time.sleep(60.0)
+        time.sleep(600.0)
     if isinstance(task, Path):
         _wait_for(task)
     elif isinstance(task, float):
@@ -26,11 +27,7 @@ def work(task):
 def _wait_for(path):
     """Until a file is there: what ends work when a test says so, however busy the machine is."""
     path.with_suffix('.begun').touch()
-    until = time.monotonic() + 60.0
-    while not path.exists():
-        if time.monotonic() > until:
-            raise ValueError('waited in vain')
-        time.sleep(0.005)
+    until(path.exists)
 
 
 def write_twice(begun, ended):

@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from support.waiting import until
 
 from thermal_fiducial.cameras.capture import Capture
 from thermal_fiducial.cameras.choice import longest_silence, make_source
@@ -51,11 +52,8 @@ def captured(source, done, **options):
     """Frames and states until ``done`` holds for them."""
     frames, states = [], []
     capture = Capture(source, frames.append, states.append, retry=0.01, **options)
-    deadline = time.monotonic() + 60.0
-    while not done(frames, states) and time.monotonic() < deadline:
-        time.sleep(0.002)
+    until(lambda: done(frames, states))
     capture.close()
-    assert done(frames, states)
     return capture, frames, states
 
 

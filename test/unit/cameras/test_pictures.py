@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from support.empty_picture import png
+from support.waiting import PATIENCE_S
 
 from thermal_fiducial.cameras.pictures import Pictures
 from thermal_fiducial.cameras.source import EndOfFramesError
@@ -65,13 +66,13 @@ def test_a_folder_that_is_emptied_ends(folder):
 
 
 def test_a_slow_rate_does_not_hold_the_reader(folder):
-    source = Pictures(str(folder), 0.1)
+    source = Pictures(str(folder), 0.5 / PATIENCE_S)
     source.open()
     shown(source, 1)
     before = time.monotonic()
     assert source.read() == []
     # Half of what it would take to wait for the next one.
-    assert time.monotonic() - before < 5.0
+    assert time.monotonic() - before < PATIENCE_S
 
 
 def test_pictures_that_cannot_be_used_are_counted(folder):

@@ -15,6 +15,7 @@ from shapely.geometry import box, Point, Polygon
 from shapely.ops import unary_union
 from support.commands import status
 from support.opencv import opencv_detector, opencv_dictionary
+from support.waiting import PATIENCE_S
 
 from thermal_fiducial.calibration.targets import CircleGrid
 from thermal_fiducial.cli.main import main
@@ -205,7 +206,7 @@ def test_svg_shows_in_a_browser(tmp_path):
         ['chromium', *options, f'--screenshot={picture}', str(tmp_path / 'it.svg')],
         capture_output=True,
         check=True,
-        timeout=60,
+        timeout=PATIENCE_S,
     )
     pixels = cv2.imread(str(picture)).astype(int)
     spread = pixels.max(axis=2) - pixels.min(axis=2)

@@ -17,11 +17,13 @@ from std_srvs.srv import Trigger
 from support import small_bag
 from support.messages import info
 from support.ros_graph import ros_graph
+from support.waiting import PATIENCE_S
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.mapping.map_data import MapperResult
 from thermal_fiducial.core.measurements import MARKER_DTYPE
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files import atomic
 from thermal_fiducial.files.atomic import locked
 from thermal_fiducial.files.bag_writer import BagWriter, STORAGES
 from thermal_fiducial.files.bags import BagReader, IMU_TOPIC
@@ -278,8 +280,9 @@ def test_a_disk_that_is_full_in_flight_is_reported_until_it_takes_the_map_again(
 
 
 @pytest.mark.ros
-def test_frames_do_not_wait_for_a_disk_that_does_not_answer(tmp_path, homes):
+def test_frames_do_not_wait_for_a_disk_that_does_not_answer(tmp_path, homes, monkeypatch):
     """Here it is another program that keeps the lock of the folder for longer than anybody waits."""
+    monkeypatch.setattr(atomic, 'PATIENCE_S', PATIENCE_S)
     keeper, grown = learned(tmp_path / 'maps')
     before = keeper.path.read_bytes()
     with ros_graph() as graph:
@@ -288,8 +291,8 @@ def test_frames_do_not_wait_for_a_disk_that_does_not_answer(tmp_path, homes):
         with locked(keeper.path):
             began = time.monotonic()
             response = graph.call(Trigger, 'marker_mapper/save', Trigger.Request())
-            # Two folders, five seconds each, until the map is saved elsewhere.
-            assert time.monotonic() - began < 5.0
+            # A second is the patience of services; that for the lock is more than a busy machine needs for all else.
+            assert time.monotonic() - began < 0.5 * PATIENCE_S
             assert (response.success, 'the disk is busy' in response.message) == (False, True)
             assert keeper.path.read_bytes() == before
         graph.spin_until(lambda: keeper.path.read_bytes() != before)

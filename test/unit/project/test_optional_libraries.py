@@ -8,6 +8,7 @@ import sys
 
 import pytest
 from support.run_folders import make_run
+from support.waiting import PATIENCE_S
 
 import thermal_fiducial.core
 from thermal_fiducial.files.packages import remedy
@@ -31,7 +32,7 @@ def python(code, hidden, *arguments):
         [sys.executable, '-c', BLOCK.format(names=hidden) + code, *arguments],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
 
 

@@ -381,7 +381,7 @@ def test_services_timers_and_parameters_that_fail_end_nothing(graph, monkeypatch
         response = graph.call(Trigger, 'pose_ekf/reset', Trigger.Request())
         assert (response.success, 'ZeroDivisionError' in response.message) == (False, True)
         fault.setattr(node, 'figures', fail)
-        graph.spin_until(lambda: node.refused > 0, seconds=20.0)
+        graph.spin_until(lambda: node.refused > 0)
     assert graph.call(Trigger, 'pose_ekf/reset', Trigger.Request()).success
 
 

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 import runpy
-import signal
 
 import pytest
 from rcl_interfaces.srv import GetParameters
 from support import launch_api, small_bag
+from support.empty_stage import STOPPED
 from support.ros_graph import ros_graph
 import yaml
 
@@ -15,9 +15,6 @@ from thermal_fiducial.files.marker_map import load_map
 ROOT = Path(__file__).resolve().parents[3]
 NAMES = ('left', 'right')
 NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf')
-#: Statuses of a node that was asked to stop: SIGPROF ends one that DDS does not let go of, after all is saved.
-STOPPED = {0, -signal.SIGPROF}
-
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 
@@ -48,7 +45,7 @@ def wait_for(graph, nodes, topics):
     def all_topics():
         return {name for name, _ in graph.tester.get_topic_names_and_types()}
 
-    graph.spin_until(lambda: {*nodes, *topics} <= known(), seconds=60.0)
+    graph.spin_until(lambda: {*nodes, *topics} <= known())
     return all_topics()
 
 
@@ -103,8 +100,8 @@ def test_a_node_that_crashes_comes_back_and_one_that_refuses_its_parameters_does
     with ros_graph() as graph:
         wait_for(graph, ['/marker_mapper'], [])
         launched.running('/marker_mapper').kill()
-        graph.spin_until(lambda: len(launched.processes['/marker_mapper']) == 2, seconds=30.0)
-        graph.spin_until(lambda: len(launched.said) == 2, seconds=30.0)
+        graph.spin_until(lambda: len(launched.processes['/marker_mapper']) == 2)
+        graph.spin_until(lambda: len(launched.said) == 2)
     assert sorted(launched.said) == [
         'marker_mapper: ended with status -9; it is started again',
         'pose_ekf: unusable parameters or arguments (see above); it is not started again',

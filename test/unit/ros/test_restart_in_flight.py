@@ -10,6 +10,7 @@ import pytest
 from std_srvs.srv import SetBool
 from support.messages import imu, pose
 from support.ros_graph import ros_graph
+from support.waiting import PATIENCE_S
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.clock_offset import recent_clock_offset, save_clock_offset
@@ -175,7 +176,7 @@ def test_a_slow_disk_holds_no_answer_of_freeze_and_keeps_the_last(tmp_path, monk
     idle = threading.Event()
 
     def save(*arguments):
-        assert idle.wait(60.0)
+        assert idle.wait(PATIENCE_S)
         save_for_restart(*arguments)
 
     monkeypatch.setattr(freeze_memory, 'save_for_restart', save)
@@ -233,7 +234,7 @@ def test_a_slow_disk_holds_no_pose(monkeypatch):
     idle, written = threading.Event(), []
 
     def save(path, offset):
-        assert idle.wait(60.0)
+        assert idle.wait(PATIENCE_S)
         written.append(offset)
 
     monkeypatch.setattr(filter_memory, 'save_clock_offset', save)
