@@ -18,6 +18,7 @@ from support.empty_stage import environment, finished
 from support.ros_graph import ros_graph
 from support.waiting import PATIENCE_S
 
+from thermal_fiducial.cli.main import main
 from thermal_fiducial.config import group, param
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
@@ -191,6 +192,8 @@ def test_errors_in_the_words_of_ros_have_a_remedy(arguments, remedy):
     ('arguments', 'words'),
     [
         (('-r', '__ns:=/drone/'), 'a namespace is as /drone1, without a slash at its end'),
+        (('-r', f'__ns:=/{230 * "a"}'), 'a namespace or another name is too long'),
+        (('-r', f'imu/data:=/{250 * "a"}'), 'a namespace or another name is too long'),
         (('-p', 'use_sim_time:="true"'), "'use_sim_time' to 'true' of type 'STRING', expecting type 'BOOL'"),
     ],
 )
@@ -200,6 +203,13 @@ def test_what_rclpy_refuses_of_a_node_ends_it_for_good(arguments, words):
     done = finished(program, '--ros-args', *arguments)
     assert (done.returncode, 'Traceback' in done.stderr) == (2, False)
     assert words in done.stderr
+
+
+@pytest.mark.parametrize('command', ['watch', 'check-bridge'])
+def test_what_rclpy_refuses_of_a_node_is_one_line_of_a_command(command, capfd):
+    """It ended with a traceback."""
+    assert main([command, '--ros-args', '-r', '__ns:=/drone/']) == 2
+    assert capfd.readouterr().err.splitlines()[-1].endswith('a namespace is as /drone1, without a slash at its end')
 
 
 def without_a_home(program, *arguments):

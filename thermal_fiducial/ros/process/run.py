@@ -1,6 +1,6 @@
 """The run loop of all nodes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 import os
@@ -10,7 +10,7 @@ from typing import Any
 
 import rclpy
 from rclpy.context import Context
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import get_logger
 from rclpy.signals import SignalHandlerOptions
@@ -18,7 +18,7 @@ from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import params
-from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.base.node import Made, StageNode
 from thermal_fiducial.ros.process.low_latency import keep_for_good, take_priority
 from thermal_fiducial.ros.process.nonblocking_output import drop_what_does_not_fit, say_last
 from thermal_fiducial.ros.process.stale_shared_memory import remove_stale_memory
@@ -65,8 +65,11 @@ _HINTS = {
     'Sequence should be of same type': ': among decimal numbers write 0.0 for 0',
     '__ns:=': ': a namespace begins with a slash, as /drone1',
 }
-#: Of rcl's error for a node whose name or namespace is none.
-_NO_NAME = 'invalid node name'
+#: The same for names of a node and its topics.
+_HINTS_OF_NAMES = {
+    'invalid node name': ': a namespace is as /drone1, without a slash at its end',
+    'topic length': ': a namespace or another name is too long',
+}
 
 #: Arguments of what runs for a command and not on a robot: no files in ~/.ros/log, which may not be writable.
 OF_A_COMMAND = ('--ros-args', '--disable-external-lib-logs')
@@ -104,17 +107,21 @@ def initialise(
             return
         if _is_secured() and not os.environ.get('ROS_SECURITY_KEYSTORE'):
             raise InputError('ROS_SECURITY_ENABLE is true, and ROS_SECURITY_KEYSTORE is not set') from None
-        hint = next((hint for part, hint in _HINTS.items() if part in str(error)), '')
-        raise InputError(_first_line(error) + hint) from None
+        raise InputError(_first_line(error) + _hint(error, _HINTS)) from None
 
 
 def _is_secured() -> bool:
     return os.environ.get('ROS_SECURITY_ENABLE', '') == 'true'
 
 
-def _first_line(error: RuntimeError) -> str:
+def _hint(error: Exception, hints: Mapping[str, str]) -> str:
+    return next((hint for part, hint in hints.items() if part in str(error)), '')
+
+
+def _first_line(error: Exception) -> str:
     """The message of rcl, without its source line."""
-    return str(error).splitlines()[0].removeprefix('failed to initialize rcl: ').partition(', at /')[0]
+    line = str(error).splitlines()[0].removeprefix('failed to initialize rcl: ')
+    return line.partition(', at /')[0].removesuffix(':')
 
 
 def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = None) -> int:
@@ -167,7 +174,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             remove_stale_memory()
             initialise(args, signals=SignalHandlerOptions.NO)
             _refuse_others(args)
-            node = _made(make_node)
+            node = made(make_node)
             ending.callback(node.destroy_node)
             node.remark(params.doubts_of_files(node.get_fully_qualified_name(), sys.argv if args is None else args))
             executor = make_executor()
@@ -200,18 +207,18 @@ def _close(node: StageNode[Any], crashed: type[BaseException] | None, *_: object
         node.get_logger().error(str(error))
 
 
-def _made(make_node: Callable[[], StageNode[Any]]) -> StageNode[Any]:
-    """The node; InputError if SROS2 denies it, or rclpy its name or parameters, so that it is not restarted."""
+def made(make_node: Callable[[], Made], context: Context | None = None) -> Made:
+    """The node in ``context``; InputError if SROS2 denies it, or rclpy its names or parameters: it is not restarted."""
     try:
         return make_node()
     except ParameterException as error:
         # Of use_sim_time, which rclpy declares before ours.
         raise InputError(str(error)) from None
-    except RuntimeError as error:
-        if _is_secured() and ok():
+    except (RuntimeError, NameValidationException) as error:
+        if _is_secured() and ok(context=context):
             raise InputError(f'ROS_SECURITY_ENABLE is true: {_first_line(error)}') from None
-        if _NO_NAME in str(error):
-            raise InputError(f'{_first_line(error)}: a namespace is as /drone1, without a slash at its end') from None
+        if hint := _hint(error, _HINTS_OF_NAMES):
+            raise InputError(_first_line(error) + hint) from None
         raise
 
 

@@ -7,7 +7,7 @@ from typing import Any
 from rclpy.context import Context
 from rclpy.node import Node
 
-from thermal_fiducial.ros.process.run import initialise, make_executor, OF_A_COMMAND
+from thermal_fiducial.ros.process.run import initialise, made, make_executor, OF_A_COMMAND
 
 
 @contextmanager
@@ -21,12 +21,12 @@ def observer(name: str, ros_arguments: Sequence[str], domain_id: int | None) -> 
     Raises
     ------
     InputError
-        Arguments that ROS cannot read.
+        Arguments that ROS cannot read, or names that it refuses.
     """
     context = Context()
     initialise([*OF_A_COMMAND, *ros_arguments], context, domain_id)
     executor = make_executor(context)
-    node = Node(name, context=context)
+    node = made(lambda: Node(name, context=context), context)
     try:
         executor.add_node(node)
         yield node, executor
