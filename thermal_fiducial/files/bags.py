@@ -173,7 +173,8 @@ class BagReader:
             check_file(file)
         bound_decompression()
         with self._readable():
-            reader = Rosbag1Reader(self.path) if self.path.suffix == '.bag' else Rosbag2Reader(self.path)
+            is_ros1 = self.path.suffix == '.bag' and self.path.is_file()
+            reader = Rosbag1Reader(self.path) if is_ros1 else Rosbag2Reader(self.path)
             reader.open()
         self._reader = reader
         try:

@@ -73,6 +73,13 @@ def test_a_single_file_of_a_bag_is_a_bag(tmp_path, storage):
         assert len(list(bag.messages())) == 20
 
 
+@pytest.mark.parametrize('suffix', ['.mcap', '.db3', '.bag'])
+def test_a_folder_may_be_named_as_a_file(tmp_path, storage, suffix):
+    """One named x.bag, as ``ros2 bag record -o x.bag`` makes it, was taken for a bag of ROS 1."""
+    with BagReader(write(tmp_path / f'x{suffix}', storage=storage)) as bag:
+        assert bag.message_count() == 20
+
+
 def test_writes_raw_bytes(tmp_path):
     cdr = bytes(STORE.serialize_cdr(string('raw'), STRING))
     with BagWriter(tmp_path / 'bag') as bag:
