@@ -2,10 +2,8 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-import fcntl
 import os
-from pathlib import Path
-import tempfile
+import socket
 
 from thermal_fiducial.errors import InputError
 
@@ -28,15 +26,10 @@ def own_domain() -> Iterator[int]:
     # That of the environment: the user's robot may be flying in it.
     of_user = os.environ.get('ROS_DOMAIN_ID')
     for domain in (domain for domain in _DOMAINS if str(domain) != of_user):
-        path = Path(tempfile.gettempdir()) / f'thermal_fiducial_{os.getuid()}_domain_{domain}.lock'
-        try:
-            # The folder is world-writable: a planted link is not followed, a planted file not truncated.
-            file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600), 'r+')
-        except OSError:
-            continue
-        with file:
+        with socket.socket(socket.AF_UNIX) as claim:
             try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                # An abstract name, no file: the same for all who could hear each other, and gone with the process.
+                claim.bind(f'\0thermal_fiducial_domain_{domain}')
             except OSError:
                 continue
             yield domain

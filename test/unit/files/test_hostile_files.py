@@ -25,7 +25,6 @@ from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.point_cloud import load_alignment, load_cloud
 from thermal_fiducial.files.rig_files import densities, of_camchain, of_rig
 from thermal_fiducial.files.trajectory_file import load_tum
-from thermal_fiducial.replay.domain import own_domain
 
 YAML_LOADERS = (load_map, load_camera, load_dictionary, load_alignment)
 TEXT_LOADERS = (*YAML_LOADERS, load_bad_pixels, load_tum)
@@ -203,18 +202,6 @@ def test_pictures_that_promise_more_than_any_camera(tmp_path, size):
     assert f'{path}: not a readable picture' in line
     assert kilobytes < BYTES / 1024
     assert seconds < SECONDS
-
-
-def test_a_lock_file_that_is_a_link_is_neither_followed_nor_cut(tmp_path, monkeypatch):
-    """Somebody has put links to a file of ours where the locks of all domains but the last would be."""
-    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
-    victim = tmp_path / 'victim'
-    victim.write_text('precious')
-    for domain in range(1, 89):
-        (tmp_path / f'thermal_fiducial_{os.getuid()}_domain_{domain}.lock').symlink_to(victim)
-    with own_domain() as domain:
-        assert domain == 89
-    assert victim.read_text() == 'precious'
 
 
 def _sparse(path):
