@@ -78,6 +78,17 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
         save_clock_offset(tmp_path / 'file' / 'offset.json', 0.004)
 
 
+@pytest.mark.ros
+def test_a_user_without_a_home_keeps_no_node_from_starting(monkeypatch):
+    """As in a container: filter and mapper crashed in their constructors, and were started again for ever."""
+    with ros_graph() as graph:
+        for name in ('HOME', 'ROS_HOME'):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setattr('pwd.getpwuid', {}.__getitem__)
+        for kind in (MarkerMapperNode, PoseEkfNode):
+            graph.add(kind, live=True).close()
+
+
 def fly(graph, first, last):
     for k in range(first, last):
         graph.send('imu/data', imu(k))
