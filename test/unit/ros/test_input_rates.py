@@ -65,6 +65,18 @@ def test_an_input_that_comes_when_there_is_something_new_is_not_missed():
     assert watched([30] * 24, [2] * 22 + [0] * 2, regular=False).doubt() == ''
 
 
+def test_of_two_inputs_of_one_topic_each_is_watched():
+    """As where a driver repeats a calibration that is also latched: what stopped was neither missed nor had a rate."""
+    inputs = [Input('/main'), Input('/other'), Input('/other')]
+    inputs[2].regular = False
+    rates = InputRates(inputs)
+    for second in range(12):
+        for source in inputs[: 3 if second < 8 else 1]:
+            source.count += 30
+        rates.look((second + 1) * SECOND)
+    assert rates.doubt() == 'no other any more'
+
+
 def test_the_main_input_is_waited_for_and_missed():
     assert watched([0, 0, 0]).trouble() == 'waiting for main'
     one = watched([30, 30, 0])

@@ -88,12 +88,12 @@ class InputRates:
     def __init__(self, inputs: Sequence[Input], expected: float = 0.0) -> None:
         self._inputs = inputs
         self._expected = expected
-        self._watches: dict[str, _Watch] = {}
+        self._watches: dict[Input, _Watch] = {}
 
     def look(self, time_ns: int) -> None:
         """Sample all inputs; call it once a second."""
         for source in self._inputs:
-            self._watches.setdefault(source.topic, _Watch(source)).look(time_ns)
+            self._watches.setdefault(source, _Watch(source)).look(time_ns)
 
     @property
     def _main(self) -> _Watch | None:
