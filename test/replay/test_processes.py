@@ -2,11 +2,17 @@
 
 from contextlib import redirect_stderr
 import json
+from pathlib import Path
 import re
+from shutil import which
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from support import small_bag
+from support.empty_stage import environment
+from support.waiting import until
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.files.bags import BagReader
@@ -73,6 +79,29 @@ def test_a_node_that_refuses_its_parameters_ends_the_replay(tmp_path, capfd):
     arguments = ['replay', bag, '--out', tmp_path / 'run', '--params', tmp_path / 'params.yaml']
     assert main([str(word) for word in (*arguments, '--transport', 'processes')]) == 2
     assert 'marker_size' in capfd.readouterr().err
+
+
+PROGRAM = """
+from pathlib import Path
+import os, sys, time
+from thermal_fiducial.replay.children import NodeProcesses
+
+with NodeProcesses(int(os.environ['ROS_DOMAIN_ID']), ['pose_ekf'], [], Path(sys.argv[1])) as nodes:
+    print(*nodes.cpu_seconds(), flush=True)
+    time.sleep(600.0)
+"""
+
+
+@pytest.mark.skipif(which('setpriv') is None, reason='setpriv (util-linux) is not installed')
+def test_nodes_end_with_a_replay_that_is_killed(tmp_path):
+    """They went on for ever, in a domain that the next replay took, which then waited for ever."""
+    command = [sys.executable, '-c', PROGRAM, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment()) as replay:
+        assert replay.stdout.readline() == 'pose_ekf\n'
+        (node,) = map(int, Path(f'/proc/{replay.pid}/task/{replay.pid}/children').read_text().split())
+        until((tmp_path / 'pose_ekf.txt').read_text)
+        replay.kill()
+    until(lambda: not Path(f'/proc/{node}').exists())
 
 
 def test_a_gap_of_years_is_played_as_a_minute(tmp_path):

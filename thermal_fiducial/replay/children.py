@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 import os
 from pathlib import Path
+from shutil import which
 import signal
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from thermal_fiducial.replay.own_namespace import kind_of, own_arguments
 #: Idle time after SIGINT beyond which a node counts as hung [s].
 _IDLE_S = 15.0
 _GLANCE_S = 0.05
+#: Lets the kernel stop a node when the replay ends, be it killed: nobody else would.
+_ENDS_WITH_REPLAY = ('setpriv', '--pdeathsig', 'TERM') if which('setpriv') else ()
 _TICK = os.sysconf('SC_CLK_TCK')
 
 
@@ -45,7 +48,7 @@ class NodeProcesses:
 
     def _start(self, node: str) -> None:
         module = f'thermal_fiducial.nodes.{kind_of(node)}'
-        command = [sys.executable, '-m', module, *self._arguments, *own_arguments(node)]
+        command = [*_ENDS_WITH_REPLAY, sys.executable, '-m', module, *self._arguments, *own_arguments(node)]
         with self._log(node).open('ab') as log:
             self._processes[node] = subprocess.Popen(
                 command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
