@@ -109,8 +109,8 @@ def test_a_process_that_has_ended_is_no_node():
 
 @pytest.mark.ros
 def test_a_node_that_does_not_end_well_is_named(tmp_path):
-    refused = pytest.raises(InputError, match='image_rate')
-    with NodeProcesses(77, ['tau2_camera'], ['-p', 'image_rate:=-1.0'], tmp_path) as nodes, refused:
+    refused, domain = pytest.raises(InputError, match='image_rate'), int(os.environ['ROS_DOMAIN_ID'])
+    with NodeProcesses(domain, ['tau2_camera'], ['-p', 'image_rate:=-1.0'], tmp_path) as nodes, refused:
         while True:
             nodes.check()
             time.sleep(0.02)

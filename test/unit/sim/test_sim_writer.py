@@ -190,7 +190,7 @@ def test_workers_that_are_sending_frames_do_not_hold_up_an_error(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures('threads_wait')
-@pytest.mark.timeout(60, method='thread')
+@pytest.mark.timeout(600, method='thread')
 def test_a_worker_that_is_killed_while_it_sends_frames_ends_the_command(tmp_path):
     """As for lack of memory: half a result is in its pipe, and the rest of it never comes."""
 
