@@ -9,11 +9,13 @@ from thermal_fiducial.errors import InputError
 
 #: Domains above 101 use Linux's ephemeral ports; 0 is the default domain.
 _DOMAINS = range(1, 90)
+#: UDP ports of domain 0, and how many each domain has (DDSI-RTPS 2.5, 9.6.2.3).
+_FIRST_PORT, _PORTS = 7400, 250
 
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Number of a domain that no other replay on this machine uses, nor the user, for as long as the context lasts.
+    """Number of a domain that nobody on this machine uses, and no other replay, for as long as the context lasts.
 
     Discovery is restricted to this machine, for this process and those that it starts.
 
@@ -32,6 +34,19 @@ def own_domain() -> Iterator[int]:
                 claim.bind(f'\0thermal_fiducial_domain_{domain}')
             except OSError:
                 continue
-            yield domain
-            return
+            if _is_silent(domain):
+                yield domain
+                return
     raise InputError(f'all {len(_DOMAINS)} DDS domains for replays are in use on this machine')
+
+
+def _is_silent(domain: int) -> bool:
+    """Whether no program of this machine, such as the nodes of a robot, listens to any of a domain's ports."""
+    first = _FIRST_PORT + domain * _PORTS
+    for port in range(first, first + _PORTS):
+        with socket.socket(type=socket.SOCK_DGRAM) as listener:
+            try:
+                listener.bind(('', port))
+            except OSError:
+                return False
+    return True
