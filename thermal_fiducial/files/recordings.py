@@ -7,7 +7,7 @@ EuRoC (ASL): ``[mav0/]imu0/data.csv``, ``CAMERA/data.csv`` with pictures, a ``se
 Kalibr: ``imu0.csv`` and pictures ``CAMERA/STAMP.png``, with a camchain and an IMU file.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 import math
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
-from thermal_fiducial.core.measurements import CameraPose, ImuSample
+from thermal_fiducial.core.measurements import CameraPose, CORNER_FIELDS, ImuSample
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import csv_rows
@@ -27,6 +27,10 @@ from thermal_fiducial.files.records import is_imu_reading
 from thermal_fiducial.files.rig_files import body_sensor, densities, of_camchain, of_rig, of_sensor, Rig
 from thermal_fiducial.files.trajectory_file import load_tum
 
+#: Columns of our files, in this order whether a header names them or not.
+_IMU = ('stamp_ns', 'wx', 'wy', 'wz', 'ax', 'ay', 'az')
+_CORNERS = ('stamp_ns', 'id', *CORNER_FIELDS, 'sigma_px')
+_POSES = ('stamp_ns', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
 #: Limit of the marker IDs of detections, above any dictionary, and of their corners' standard deviations [px].
 MOST_IDS, LARGEST_SIGMA_PX = 100_000, 100.0
 #: Deviation of a quaternion's norm from 1, as in maps.
@@ -159,16 +163,18 @@ def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) 
 # --- tables -------------------------------------------------------------------------------------------
 
 
-def _lines(path: Path, least: int) -> Iterator[tuple[int, list[str]]]:
+def _lines(path: Path, least: int, names: Sequence[str] = ()) -> Iterator[tuple[int, list[str]]]:
     """Number and cells of each line, without comments and header.
 
     Raises
     ------
     InputError
-        Unreadable, no lines, or a line with fewer cells than ``least``.
+        Unreadable, no lines, a line with fewer cells than ``least``, or a header with ``names`` of columns elsewhere.
     """
     head, empty = True, True
     for number, words in csv_rows(path):
+        if words[0].lstrip('# ') in names[:1]:
+            _require_order(f'{path} line {number}', words, names)
         if words[0].startswith('#'):
             continue
         names_columns, head = head and not words[0][:1].isdigit(), False
@@ -182,12 +188,19 @@ def _lines(path: Path, least: int) -> Iterator[tuple[int, list[str]]]:
         raise InputError(f'{path}: no lines of numbers')
 
 
+def _require_order(where: str, head: Sequence[str], names: Sequence[str]) -> None:
+    """Raise InputError for a header with one of ``names`` in another column: values are known by their places."""
+    for column, name in enumerate(head):
+        if name in names and names.index(name) != column:
+            raise InputError(f'{where}: column {column + 1} is {name}; they are {", ".join(names)}')
+
+
 def _table(
-    path: Path, columns: int, possible: Callable[[list[float]], bool] = lambda _: True
+    path: Path, columns: int, possible: Callable[[list[float]], bool], names: Sequence[str] = ()
 ) -> tuple[IntArray, FloatArray]:
     """Stamps (N,) [ns] and values (N, M) of at least ``columns`` columns, stamp included; each row is ``possible``."""
     stamps, rows = [], []
-    for number, words in _lines(path, columns):
+    for number, words in _lines(path, columns, names):
         where = f'{path} line {number}'
         stamps.append(_stamp(where, words[0]))
         rows.append(_numbers(where, words[1:]))
@@ -223,7 +236,7 @@ def imu_samples(path: Path) -> list[ImuSample]:
     InputError
         Unreadable, no such columns, or most likely in other units; the message names file and line.
     """
-    stamps, values = _table(path, 7, lambda row: is_imu_reading(row[:3], row[3:6]))
+    stamps, values = _table(path, 7, lambda row: is_imu_reading(row[:3], row[3:6]), _IMU)
     check_units(path, stamps, values)
     return [ImuSample(int(stamp), row[:3], row[3:6]) for stamp, row in zip(stamps, values, strict=True)]
 
@@ -251,7 +264,7 @@ def _is_detection(row: list[float]) -> bool:
 
 
 def _corners(path: Path) -> Iterator[Corners]:
-    stamps, values = _table(path, 10, _is_detection)
+    stamps, values = _table(path, 10, _is_detection, _CORNERS)
     order = np.argsort(stamps, kind='stable')
     stamps, values = stamps[order], values[order]
     for rows in np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps)) + 1):
@@ -265,7 +278,7 @@ def _is_pose(row: list[float]) -> bool:
 
 
 def _poses(path: Path) -> list[CameraPose]:
-    stamps, values = _table(path, 44, _is_pose)
+    stamps, values = _table(path, 44, _is_pose, _POSES)
     T_map_camera = transform_from_quaternion(values[:, :3], values[:, 3:7])
     covariances = checked_covariance(values[:, 7:43].reshape(-1, 6, 6), f'{path}: pose with a covariance')
     rows = zip(stamps, T_map_camera, covariances, strict=True)

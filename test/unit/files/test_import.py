@@ -109,6 +109,15 @@ def test_camera_poses_with_their_covariance(ours):
     np.testing.assert_array_equal(message.pose.covariance, covariance)
 
 
+@pytest.mark.parametrize('comment', ['', '# '])
+def test_quaternions_whose_header_has_w_first_are_refused(ours, capsys, comment):
+    """They were taken for x y z w; numpy writes a header as a comment."""
+    (ours / 'camera_pose.csv').write_text(f'{comment}stamp_ns,x,y,z,qw,qx,qy,qz\n{FRAMES[0]},1,2,3,1,0,0,0\n')
+    assert run(ours) == 2
+    said = capsys.readouterr().err
+    assert 'camera_pose.csv line 1: column 5 is qw; they are stamp_ns, x, y, z, qx, qy, qz, qw' in said
+
+
 def test_frames_may_come_before_the_clock_of_the_imu_begins(ours):
     """Both clocks begin at 0, that of the camera 20 ms early."""
     for name in ('imu.csv', 'cam1.csv'):
@@ -228,6 +237,8 @@ def corrupt(path, change):
         ('imu.csv', lambda text: text.replace('000000,0.1', ',0.1'), ('imu.csv', '5e-09 s apart', 'nanoseconds')),
         ('imu.csv', lambda text: re.sub('1,2,.*', '0.1,0.2,1', text), ('imu.csv', 'in g')),
         ('imu.csv', lambda text: text.replace(',0.3,', ',40,'), ('imu.csv', 'degrees')),
+        ('imu.csv', lambda text: text.replace('wx,wy,wz', 'wz,wy,wx'), ('imu.csv line 1', 'column 2 is wz')),
+        ('cam1.csv', lambda text: text.replace('u1,v1', 'v1,u1'), ('cam1.csv line 1', 'column 5 is v1')),
         ('cam1.csv', lambda text: text.replace(',20,', ',1e30,', 1), ('cam1.csv line 2', 'measured')),
         ('cam1.csv', lambda text: re.sub('(?m)$', ',0', text), ('cam1.csv line 2', 'measured')),
     ],
