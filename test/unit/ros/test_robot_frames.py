@@ -322,6 +322,21 @@ def test_the_frame_of_the_imu_is_that_of_its_messages_where_tf_has_it(slash):
     np.testing.assert_allclose(frames.T_imu_base, inverse(T_base_imu), atol=1e-12)
 
 
+@pytest.mark.usefixtures('tf2_msgs')
+def test_tf_does_not_move_an_imu_with_its_camera_in_flight():
+    """Where the camera is mounted on the IMU the pose of the robot jumped, and nothing said so."""
+    robot = Robot()
+    frames = RobotFrames(robot)
+    T_base_imu = transform(np.eye(3), [0.0, 0.1, 0.0])
+    robot.taken['/tf_static'](static('imu_link', CAMERA, FORWARD))
+    robot.taken['/tf_static'](static('base_link', 'imu_link', T_base_imu))
+    frames.note_imu_frame('imu_link')
+    np.testing.assert_allclose(frames.T_imu_base, inverse(T_base_imu), atol=1e-12)
+    robot.taken['/tf_static'](static('base_link', 'imu_link', transform(np.eye(3), [0.0, 0.3, 0.0])))
+    np.testing.assert_allclose(frames.T_imu_base, inverse(T_base_imu), atol=1e-12)
+    assert robot.events['camera'] == '/tf_static has moved the IMU on the robot: ignored until the node is restarted'
+
+
 def test_a_state_in_another_frame_of_the_body():
     """Against numbers: the same small errors of pose and twist, seen from both frames."""
     rng = np.random.default_rng(4)

@@ -131,8 +131,11 @@ class RobotFrames:
             if T_body_camera is None or _RANKS.index(source) < _RANKS.index(self.source):
                 continue
             moved = not _same(T_body_camera, camera_in_body(config))
-            if source == self.source and moved and (T_imu_base is None) == (self.T_imu_base is None):
-                text = f'{source} has moved the camera on the robot: ignored until the node is restarted'
+            # The IMU's frame may become known late; then the filter begins anew.
+            begins = source != self.source or (self.T_imu_base is None and T_imu_base is not None)
+            if not begins and (moved or not _same(T_imu_base, self.T_imu_base)):
+                what = 'camera' if moved else 'IMU'
+                text = f'{source} has moved the {what} on the robot: ignored until the node is restarted'
                 self._node.console.event('camera', text)
                 return
             self._take(source, T_body_camera, T_imu_base, moved=moved)
@@ -177,5 +180,7 @@ class RobotFrames:
         self._node.get_logger().info(line)
 
 
-def _same(T: FloatArray, other: FloatArray) -> bool:
+def _same(T: FloatArray | None, other: FloatArray | None) -> bool:
+    if T is None or other is None:
+        return T is other
     return bool(np.allclose(T, other, rtol=0.0, atol=_SAME))
