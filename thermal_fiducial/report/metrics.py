@@ -34,6 +34,8 @@ from thermal_fiducial.report.trajectory import Trajectory
 FRAME_NS = 33_333_333
 #: Interval of the relative pose error [ns].
 RELATIVE_NS = SECOND_NS
+#: Gap of the poses above which it is a pause, which disturbs a controller [ns].
+PAUSE_NS = 100_000_000
 #: Truth is not interpolated over holes longer than this [ns].
 TRUTH_HOLE_NS = 200_000_000
 #: 95 % quantile of chi-square by degrees of freedom; two-sided 95 % interval for a pose.
@@ -239,29 +241,36 @@ def innovation_consistency(innovations: Innovations) -> dict[str, float]:
 
 
 def steps(trajectory: Trajectory) -> FloatArray:
-    """Distance of each position from the linear extrapolation of the two before it [m]: the steps by corrections."""
-    p = trajectory.positions
-    if len(p) < 3:
-        return np.zeros(0)
-    dt = np.diff(trajectory.stamps_ns).astype(np.float64)
-    predicted = p[1:-1] + (p[1:-1] - p[:-2]) * (dt[1:] / dt[:-1])[:, None]
-    return np.asarray(np.linalg.norm(p[2:] - predicted, axis=1))
+    """Distance of each position from the linear extrapolation of those before it [m]: the steps by corrections.
+
+    Over no longer than the velocity was measured, as stamps of samples that were read together are close; and not over
+    pauses, in which the body goes where it likes.
+    """
+    p, t = trajectory.positions, trajectory.stamps_ns
+    ahead = np.diff(t)[1:]
+    before = np.searchsorted(t, t[1:-1] - ahead, side='right') - 1
+    known = np.flatnonzero((before >= 0) & (ahead <= PAUSE_NS))
+    first, newest = before[known], known + 1
+    share = (ahead[known] / (t[newest] - t[first]))[:, None]
+    predicted = p[newest] + (p[newest] - p[first]) * share
+    return np.asarray(np.linalg.norm(p[newest + 1] - predicted, axis=1))
 
 
 def output(trajectory: Trajectory) -> dict[str, float]:
-    """Rate and smoothness of the output, without truth: rate, longest gap, steps."""
+    """Rate between pauses and smoothness of the output, without truth: rate, longest gap, steps."""
     if len(trajectory) < 3:
         return {'poses': len(trajectory)}
     dt = np.diff(trajectory.stamps_ns)
-    step_mm = 1e3 * steps(trajectory)
-    return {
+    flowing = dt[dt <= PAUSE_NS]
+    result = {
         'poses': len(trajectory),
-        'rate_hz': SECOND_NS / float(np.median(dt)),
+        'rate_hz': SECOND_NS / float(np.mean(flowing if len(flowing) else dt)),
         'longest_pause_ms': 1e-6 * float(dt.max()),
-        'step_p95_mm': float(np.percentile(step_mm, 95)),
-        'step_max_mm': float(step_mm.max()),
         'path_length_m': path_length(trajectory),
     }
+    if len(step_mm := 1e3 * steps(trajectory)):
+        result |= {'step_p95_mm': float(np.percentile(step_mm, 95)), 'step_max_mm': float(step_mm.max())}
+    return result
 
 
 def path_length(trajectory: Trajectory) -> float:

@@ -8,6 +8,7 @@ from thermal_fiducial.core.filter.output import TRACKING
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.evaluation import Evaluation
+from thermal_fiducial.report.metrics import PAUSE_NS
 from thermal_fiducial.report.output_bag import Diagnostic, WARNING
 
 #: NEES per degree of freedom up to which covariances are consistent, and above which they are far too small.
@@ -17,7 +18,7 @@ CAUTIOUS_NEES = 0.2
 #: Shares of refused poses that are worth a look, and that indicate a fault.
 FEW_REFUSED, MANY_REFUSED = 0.01, 0.1
 #: Gaps of the poses [ms] above which a controller is disturbed, and above which a drone drifts away.
-SHORT_PAUSE_MS, LONG_PAUSE_MS = 100.0, 500.0
+SHORT_PAUSE_MS, LONG_PAUSE_MS = 1e-6 * PAUSE_NS, 500.0
 #: Duration of coasting that is worth a look [s].
 LONG_COAST_S = 2.0
 #: Step of the pose that causes a jerk of a position controller [mm].

@@ -164,6 +164,26 @@ def test_output_rate_pauses_and_steps():
     assert result['poses'] == 1980
 
 
+def test_samples_that_are_read_together_are_no_faster_and_no_steps():
+    """80 samples a second in bursts were 7692, and the body jumped by 195 mm where nothing did."""
+    stamps = START_NS + np.arange(800) // 4 * 50_000_000 + np.arange(800) % 4 * 130_000
+    rounded = np.round(true_pose((stamps - START_NS) * 1e-9), 4)
+    result = metrics.output(Trajectory(stamps, rounded))
+    assert result['rate_hz'] == pytest.approx(80.0, rel=0.01)
+    # By what its velocity changes in 50 ms at 2 m/s^2 at most.
+    assert result['step_max_mm'] < 5.0
+
+
+def test_motion_in_a_pause_is_no_step():
+    """After a second the body is not where its velocity before would have brought it: it was 231 mm."""
+    t = trajectory(200.0, 10.0)
+    keep = (t.stamps_ns <= START_NS + 4 * 10**9) | (t.stamps_ns >= START_NS + 5 * 10**9)
+    result = metrics.output(t.take(keep))
+    assert result['step_max_mm'] < 1.0  # of smooth motion at 200 Hz
+    assert result['rate_hz'] == pytest.approx(200.0)
+    assert result['longest_pause_ms'] == pytest.approx(1000.0)
+
+
 def test_path_length_is_that_of_the_path():
     stamps = START_NS + np.arange(0, 10**10 + 1, 5_000_000)
     angle = (stamps - START_NS) * 1e-9
