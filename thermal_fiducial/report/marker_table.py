@@ -9,6 +9,7 @@ from thermal_fiducial.report.map_error import marker_errors, MarkerError, sigmas
 from thermal_fiducial.report.run_folder import Run
 
 _ON_TRIAL, _QUARANTINED = 'candidates', 'quarantine'
+QUARANTINED, FIXED = 'quarantined', 'fixed'
 
 
 @dataclass(frozen=True)
@@ -59,19 +60,20 @@ def _tag(run: Run, key: int, reasons: dict[str, dict[int, str]], error: MarkerEr
 
 def _standing(run: Run, key: int, views: int, reasons: dict[str, dict[int, str]]) -> tuple[str, str]:
     marker = None if run.marker_map is None else run.marker_map.markers.get(key)
+    localizing = run.summary.get('mode') == 'localization'
     if marker is None:
         if key in reasons[_ON_TRIAL]:
             return 'on trial', reasons[_ON_TRIAL][key]
-        localizing = run.summary.get('mode') == 'localization'
         seen = f'seen in {number_of(views, "frame")}'
         return 'not in the map', 'no marker enters the map in this mode' if localizing else seen
-    if not marker.trusted:
-        return 'quarantined', reasons[_QUARANTINED].get(key, 'contradicted the others')
+    # The file of a map that stays as it is says nothing of what was found in this flight.
+    if not marker.trusted or (localizing and key in reasons[_QUARANTINED]):
+        return QUARANTINED, reasons[_QUARANTINED].get(key, 'contradicted the others')
     if marker.fixed:
-        return 'fixed', 'surveyed, never moves'
+        return FIXED, 'surveyed, never moves'
     if not views:
         return 'used', 'from an earlier run; not seen in this one'
-    return 'used', f'{marker.observations} observations fit'
+    return 'used', f'{marker.observations} observations fit' if marker.observations else 'surveyed'
 
 
 def _reasons(run: Run, name: str) -> dict[int, str]:

@@ -11,6 +11,7 @@ from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.evaluation import Evaluation
+from thermal_fiducial.report.marker_table import FIXED, QUARANTINED, Tag
 from thermal_fiducial.report.stacked_plots import Chart, FIDUCIAL, FUSED, GOOD, MOST_DOTS, thinned, TRUTH
 from thermal_fiducial.report.trajectory import Trajectory
 
@@ -26,7 +27,8 @@ _LARGEST_M = 0.4
 _SIGMAS = 3.0
 #: View point, chosen so that the titles of all axes are visible.
 _CAMERA = {'eye': {'x': -1.6, 'y': -1.26, 'z': 0.95}, 'center': {'x': 0.0, 'y': 0.0, 'z': -0.15}}
-_COLOURS = {'fixed': '#e2a400', 'seen': FIDUCIAL, 'not seen': GOOD, 'quarantined': TRUTH}
+#: As in RViz and Foxglove: red is a fault.
+_COLOURS = {FIXED: '#e2a400', 'seen': GOOD, 'not seen': TRUTH, QUARANTINED: FIDUCIAL}
 
 
 def scene_chart(evaluation: Evaluation) -> list[Chart]:
@@ -73,19 +75,17 @@ def _path(trajectory: Trajectory, name: str, most: int, **look: Any) -> Any:
     return go.Scatter3d(x=points[:, 0], y=points[:, 1], z=points[:, 2], name=name, **({'mode': 'lines'} | look))
 
 
-def _kind(marker: MapMarker, seen: set[int]) -> str:
-    if not marker.trusted:
-        return 'quarantined'
-    return 'fixed' if marker.fixed else 'seen' if marker.id in seen else 'not seen'
+def _kind(tag: Tag) -> str:
+    return tag.status if tag.status in _COLOURS else 'seen' if tag.views else 'not seen'
 
 
 def _plates(evaluation: Evaluation, markers: Sequence[MapMarker]) -> list[Any]:
     """Squares of the markers, one trace per kind, with details of each as hover text."""
-    seen = set(np.unique(evaluation.run.detections.ids).tolist())
+    kinds = {tag.id: _kind(tag) for tag in evaluation.tags}
     words = {tag.id: f'{tag.status}: {tag.why}<br>{number_of(tag.views, "view")}' for tag in evaluation.tags}
     made: list[Any] = []
     for kind, colour in _COLOURS.items():
-        chosen = [marker for marker in markers if _kind(marker, seen) == kind]
+        chosen = [marker for marker in markers if kinds[marker.id] == kind]
         if not chosen:
             continue
         corners = np.array([corners_in_map(marker.T_map_marker, marker.size) for marker in chosen])
@@ -127,7 +127,7 @@ def _marker_covariances(markers: Sequence[MapMarker]) -> FloatArray:
 def _ellipsoids(evaluation: Evaluation, markers: Sequence[MapMarker], factor: float) -> list[Any]:
     known = [marker for marker in markers if np.any(marker.covariance[:3, :3])][:MOST_MARKERS]
     centres = np.array([marker.T_map_marker[:3, 3] for marker in known]).reshape(-1, 3)
-    made = [_ellipsoid_mesh(centres, _marker_covariances(known), factor, FIDUCIAL, 'uncertainty of markers')]
+    made = [_ellipsoid_mesh(centres, _marker_covariances(known), factor, GOOD, 'uncertainty of markers')]
     output, fused = evaluation.run.output, evaluation.run.fused
     shown = thinned(len(output.stamps_ns), MOST_POSES)
     at = np.searchsorted(fused.stamps_ns, output.stamps_ns[shown])

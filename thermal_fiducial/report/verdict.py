@@ -8,6 +8,7 @@ from thermal_fiducial.core.filter.output import TRACKING
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.core.wording import number_of
 from thermal_fiducial.report.evaluation import Evaluation
+from thermal_fiducial.report.marker_table import QUARANTINED
 from thermal_fiducial.report.metrics import PAUSE_NS
 from thermal_fiducial.report.output_bag import Diagnostic, WARNING
 
@@ -118,8 +119,9 @@ def _error(evaluation: Evaluation, numbers: dict[str, Any]) -> Remark | None:
         return Remark(Weight.NOTE, 'No ground truth: how large the errors are is not known.')
     if error is None:
         return None
+    # Nothing speaks for errors that the covariance does not claim.
     return Remark(
-        Weight.GOOD,
+        Weight.GOOD if _nees(numbers, 0.0) <= CONSISTENT_NEES else Weight.NOTE,
         f'Errors against ground truth: {error["position_rms_mm"]:.1f} mm and {error["attitude_rms_deg"]:.2f} deg rms, '
         f'{error["position_max_mm"]:.0f} mm at the worst, each pose at its own stamp.',
     )
@@ -130,7 +132,7 @@ def _truth(evaluation: Evaluation) -> Remark | None:
 
 
 def _consistency(numbers: dict[str, Any]) -> Remark | None:
-    nees = numbers['fused'].get('consistency', {}).get('pose_nees_per_dof')
+    nees = _nees(numbers)
     if nees is None:
         return None
     words = f'NEES {nees:.2g} a degree of freedom'
@@ -141,6 +143,10 @@ def _consistency(numbers: dict[str, Any]) -> Remark | None:
     if nees < CAUTIOUS_NEES:
         return Remark(Weight.NOTE, f'The covariance claims more error than there is ({words}).')
     return Remark(Weight.GOOD, f'The covariance is consistent with the errors ({words}).')
+
+
+def _nees(numbers: dict[str, Any], unknown: float | None = None) -> Any:
+    return numbers['fused'].get('consistency', {}).get('pose_nees_per_dof', unknown)
 
 
 def _refused(numbers: dict[str, Any]) -> Remark | None:
@@ -194,10 +200,12 @@ def _resets(evaluation: Evaluation) -> Remark | None:
 
 
 def _markers(evaluation: Evaluation) -> Remark | None:
-    quarantined = [str(tag.id) for tag in evaluation.tags if tag.status == 'quarantined']
-    if quarantined:
-        return Remark(Weight.DOUBT, f'Markers {", ".join(quarantined)} contradict the map.')
-    return None
+    quarantined = [str(tag.id) for tag in evaluation.tags if tag.status == QUARANTINED]
+    if not quarantined:
+        return None
+    one = len(quarantined) == 1
+    named = f'{"Marker" if one else "Markers"} {", ".join(quarantined)}'
+    return Remark(Weight.DOUBT, f'{named} {"contradicts" if one else "contradict"} the map.')
 
 
 def _warnings(evaluation: Evaluation) -> Remark | None:

@@ -218,6 +218,15 @@ def test_markers_one_by_one_with_status_and_reason(tmp_path):
     assert views[9] == 0
 
 
+def test_a_marker_quarantined_while_localizing_is_not_used(tmp_path):
+    """The map's file stays as it is: the table said "used", the verdict nothing, of a marker 300 mm off its place."""
+    run = read_run(make_run(tmp_path / 'run', seconds=3.0, gap=(1.0, 1.4), with_output=False))
+    said = {'marker_mapper': {'quarantine': '5: 9.1 px off in 30 views'}}
+    evaluation = evaluate(replace(run, summary={'diagnostics': said, 'mode': 'localization'}))
+    assert {tag.id: (tag.status, tag.why) for tag in evaluation.tags}[5] == ('quarantined', '9.1 px off in 30 views')
+    assert 'Marker 5 contradicts the map.' in [remark.text for remark in judge(evaluation, GOOD).remarks]
+
+
 # --- verdict -----------------------------------------------------------------------------------------
 
 GOOD = {
@@ -251,6 +260,15 @@ def test_what_speaks_against_a_run(tmp_path, path, value, weight, words):
     verdict = judge(evaluation, with_value(GOOD, path, value))
     assert (verdict.weight, verdict.headline) == (weight, HEADLINES[weight])
     assert words in verdict.remarks[0].text
+
+
+@pytest.mark.parametrize(('nees', 'weight'), [(0.8, Weight.GOOD), (9.0, Weight.NOTE)])
+def test_nothing_speaks_for_errors_that_are_not_claimed(tmp_path, nees, weight):
+    """100 mm of a camera that is elsewhere on the robot had a green tick."""
+    evaluation = evaluate(run_of(tmp_path, trajectory(200.0), trajectory(30.0)))
+    numbers = with_value(evaluation.numbers(), ('fused', 'consistency', 'pose_nees_per_dof'), nees)
+    remarks = judge(evaluation, numbers).remarks
+    assert [remark.weight for remark in remarks if 'against ground truth' in remark.text] == [weight]
 
 
 def judged(tmp_path, *said, gap=0.0):
