@@ -12,12 +12,13 @@ from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.ranges import CONTRAST_K, FLIGHT_S, FOG_PER_M, FRAME_HZ, LAG_S, OFFSET_S, PROCESSES, READOUT_S
 from thermal_fiducial.cli.simulate_corners import write_corner_flight
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import STORAGES
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.render import Quality
 from thermal_fiducial.sim.scenario import LENSES, named, Scenario, SCENARIOS, with_contrast, with_lens
 from thermal_fiducial.sim.sensor import FFC_BEHAVIOURS, Sensor
-from thermal_fiducial.sim.thermal_camera import FlightPlan, plan
+from thermal_fiducial.sim.thermal_camera import FlightPlan, plan, sees_markers
 from thermal_fiducial.sim.writer import write_flight
 
 _OWN = "the scenario's"
@@ -89,6 +90,9 @@ def run(args: argparse.Namespace) -> int:
     """Simulate the flight, print how to replay it."""
     scenario = _scenario(args)
     flight = plan(scenario, args.seconds, args.seed, quality=_quality(scenario.sensor.frame_rate))
+    if args.trajectory is not None and not sees_markers(flight):
+        why = 'poses must be of base_link in the map of the scenario, in metres, quaternions x y z w'
+        raise InputError(f'{args.trajectory}: no frame shows a marker of {scenario.name}: {why}')
     with progress_bar(f'{scenario.name}, {flight.seconds:g} s') as show:
         advance = counted(show, flight.frame_count)
         if scenario.corner_noise is None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.trajectory_file import load_tum
@@ -14,6 +15,8 @@ from thermal_fiducial.sim.spline_trajectory import SplineTrajectory
 # Ten poses a second resolve the motion of a drone or a hand, but little of the poses' noise: a millimetre of noise
 # becomes 0.1 m/s^2 in the simulated accelerometer.
 _KNOTS_PER_SECOND = 10
+# What the accelerometer of a drone measures at most [m/s^2].
+_MEASURABLE = ImuNoise().accelerometer_range
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +41,20 @@ class RecordedFlight:
         Raises
         ------
         InputError
-            Unreadable, or shorter than two seconds.
+            Unreadable, shorter than two seconds, or faster than an IMU can follow, as in millimetres.
         """
         stamps, positions, quaternions = load_tum(path)
         stamps, first = np.unique(stamps, return_index=True)
         times = (stamps - stamps[0]) * 1e-9
         if times[-1] < 2.0:
             raise InputError(f'{path}: poses of {times[-1]:g} s are too short for a flight')
-        return cls(times, positions[first], quaternions[first])
+        flight = cls(times, positions[first], quaternions[first])
+        dense = np.linspace(0.0, flight.seconds, len(times))
+        acceleration = np.linalg.norm(flight.trajectory(flight.seconds, 0)(dense).acceleration, axis=1)
+        if (largest := acceleration.max()) > _MEASURABLE:
+            when = f'{largest:.0f} m/s^2 after {dense[acceleration.argmax()]:.1f} s'
+            raise InputError(f'{path}: {when}, more than an IMU measures: positions must be in metres')
+        return flight
 
     @property
     def seconds(self) -> float:

@@ -167,6 +167,14 @@ def true_corners(
     return {marker.id: pixels for (marker, pixels), covered in zip(seen, hidden, strict=True) if not covered}
 
 
+def sees_markers(flight: FlightPlan) -> bool:
+    """Whether any frame of a flight shows a marker."""
+    scenario = flight.scenario
+    times = [flight.frame_time(index) for index in range(flight.frame_count)]
+    poses = scenario.trajectory(flight.seconds, flight.seed)(times).T_map_body @ scenario.T_body_camera
+    return any(true_corners(scenario.lens, scenario.markers, [], T) for T in poses)
+
+
 def _unfolded(lens: Lens, points: FloatArray, pixels: FloatArray) -> BoolArray:
     """Whether the lens maps the pixels back to the points: distortion folds points beyond its field into the image."""
     slopes = points[..., :2] / points[..., 2:]

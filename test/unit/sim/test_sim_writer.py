@@ -308,6 +308,24 @@ def test_command_follows_a_trajectory(tiny_scenario, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ('unit', 'turn', 'says'),
+    [
+        (1000.0, '0 0 0 1', ' s, more than an IMU measures: positions must be in metres'),
+        (1.0, '0 0 1 0', 'no frame shows a marker of april: poses must be of base_link in the map of the scenario'),
+    ],
+)
+def test_a_trajectory_that_no_drone_flew_before_these_markers_is_refused(tmp_path, capsys, unit, turn, says):
+    """In millimetres it made a bag, without a word, that ``replay`` refused for lack of images."""
+    x = unit * (-2.0 + 0.25 * np.sin(np.arange(60) / 10.0))
+    lines = [f'{0.1 * n:.1f} {place} 0 {0.7 * unit} {turn}\n' for n, place in enumerate(x)]
+    (tmp_path / 'path.tum').write_text(''.join(lines))
+    command = ['simulate', tmp_path / 'bag', '--scenario', 'april', '--trajectory', tmp_path / 'path.tum']
+    assert status(command) == 2
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / 'bag').exists()
+
+
+@pytest.mark.parametrize(
     ('options', 'says'),
     [
         (['--scenario', 'moon'], 'moon'),
