@@ -3,11 +3,12 @@
 import argparse
 from pathlib import Path
 
+from thermal_fiducial.cli.arguments import warn
 from thermal_fiducial.cli.evaluate import print_tables
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.files.marker_map import load_map
-from thermal_fiducial.report.map_error import map_accuracy, marker_errors
+from thermal_fiducial.report.map_error import doubt_of_dictionary, map_accuracy, marker_errors
 from thermal_fiducial.report.tables import map_error_table
 from thermal_fiducial.report.text_table import number, Table
 
@@ -27,6 +28,8 @@ def _error(args: argparse.Namespace) -> int:
     sizes = args.marker_size, size_overrides(tuple(args.marker_size_override))
     estimate, truth = load_map(args.map, *sizes), load_map(args.truth, *sizes)
     numbers = map_accuracy(estimate, truth)
+    if doubt := doubt_of_dictionary(estimate, truth):
+        warn(doubt)
     rows = [
         (
             str(error.id), number(error.position_mm), number(error.attitude_deg), number(error.sigma_mm),

@@ -11,7 +11,7 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_
 from thermal_fiducial.report import metrics
 from thermal_fiducial.report.availability import at_frames, Available, available
 from thermal_fiducial.report.interruptions import imu_silence_ns, Interruption, interruptions, run_span
-from thermal_fiducial.report.map_error import map_accuracy
+from thermal_fiducial.report.map_error import doubt_of_dictionary, map_accuracy
 from thermal_fiducial.report.marker_table import Tag, tags
 from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.truth_clock import doubt_of_clock
@@ -44,7 +44,12 @@ class Evaluation:
 
     @cached_property
     def doubt_of_truth(self) -> str:
-        """That the ground truth seems to be in another clock, or to have w before x y z, in words; empty if not."""
+        """That the ground truth seems to be of other markers, in another clock, or to have w before x y z, in words.
+
+        Empty if not.
+        """
+        if (maps := self._comparable_maps()) is not None and (doubt := doubt_of_dictionary(*maps)):
+            return doubt
         e, truth = self.fused_errors, self.run.truth
         if e is None or truth is None or not len(e):
             return ''

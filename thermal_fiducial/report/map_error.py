@@ -1,6 +1,7 @@
 """Errors of a map against the true one, per marker."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -38,6 +39,12 @@ def marker_errors(estimate: MarkerMap, truth: MarkerMap) -> dict[int, MarkerErro
     """Errors of the markers that both maps have, by ID."""
     common = sorted(estimate.markers.keys() & truth.markers.keys())
     return {key: _marker_error(estimate.markers[key], truth.markers[key]) for key in common}
+
+
+def doubt_of_dictionary(estimate: MarkerMap, truth: MarkerMap) -> str:
+    """That the two maps have other markers under the same IDs, in words; empty if not."""
+    own, true = Path(estimate.dictionary).name, Path(truth.dictionary).name
+    return '' if own == true else f'The map has markers of {own}, the true one of {true}.'
 
 
 def _marker_error(marker: MapMarker, true: MapMarker) -> MarkerError:

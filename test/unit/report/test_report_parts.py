@@ -187,6 +187,10 @@ def test_error_of_a_map_against_the_true_one(tmp_path, capsys, monkeypatch):
     printed = capsys.readouterr().out
     assert re.search(r'position error, largest +mm +5.00 ', printed)
     assert re.search(r'\n +5 +5\.00 +0 ', printed)
+    save_map(tmp_path / 'true.yaml', replace(true, dictionary='DICT_5X5_100'))
+    assert main(['map', 'error', str(tmp_path / 'map.yaml'), str(tmp_path / 'true.yaml')]) == 0
+    warned = 'warning: The map has markers of DICT_4X4_50, the true one of DICT_5X5_100.'
+    assert warned in capsys.readouterr().err
     save_map(tmp_path / 'other.yaml', MarkerMap({1: replace(marker, id=1)}))
     assert main(['map', 'error', str(tmp_path / 'map.yaml'), str(tmp_path / 'other.yaml')]) == 2
     assert 'no marker in common' in capsys.readouterr().err
@@ -197,6 +201,9 @@ def test_the_true_map_beside_the_truth_is_found(tmp_path):
     assert 'map' not in evaluate(read_run(run)).numbers()
     save_map(run / 'map_true.yaml', wall())
     assert evaluate(read_run(run)).numbers()['map']['position_rms_mm'] == pytest.approx(0.0, abs=1e-6)
+    assert not evaluate(read_run(run)).doubt_of_truth
+    save_map(run / 'map_true.yaml', replace(wall(), dictionary='DICT_5X5_100'))
+    assert evaluate(read_run(run)).doubt_of_truth.endswith('the true one of DICT_5X5_100.')
 
 
 def test_markers_one_by_one_with_status_and_reason(tmp_path):
