@@ -65,6 +65,8 @@ def test_all_is_well():
 
 STATES = [
     ({'tau2_camera': (1, 'FFC')}, Advice.FLY, ''),
+    ({'tau2_camera': (1, 'frozen')}, Advice.FLY, ''),
+    ({'tau2_camera': (1, 'camera stalled: frozen')}, Advice.CARE, 'tau2_camera: camera stalled: frozen'),
     ({'pose_ekf': (1, 'coasting: 1.2 s without a pose')}, Advice.CARE, 'coasting: 1.2 s without a pose'),
     ({'marker_mapper': (1, 'quarantined: 7')}, Advice.CARE, 'marker_mapper: quarantined: 7'),
     ({'tau2_camera': (2, 'frozen')}, Advice.CARE, 'tau2_camera: frozen'),
@@ -85,6 +87,7 @@ def test_figures_of_a_silent_filter_are_not_shown():
 
     assert [shown(4.0)[name] for name in ('clock offset', 'usable without markers')] == ['18.2 +- 0.4', '9.8']
     assert [shown(8.0)[name] for name in ('clock offset', 'usable without markers', 'sigma')] == ['', '', '']
+    assert [shown(8.0)[name] for name in ('latency', 'camera latency')] == ['', '']
 
 
 def test_silence_is_no_pose():

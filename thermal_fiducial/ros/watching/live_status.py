@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
-from thermal_fiducial.core.imaging.frame_cleaner import SHUTTER
+from thermal_fiducial.core.imaging.frame_cleaner import FROZEN, SHUTTER
 from thermal_fiducial.files.innovations import LAST_REFUSED
 
 #: Timeouts of odometry, after which there is no pose to fly on, and of a node's diagnostics [s].
@@ -92,10 +92,9 @@ class _Topic:
             return ''
         return f'{(len(recent) - 1) / (recent[-1] - recent[0]):.0f}'
 
-    @property
-    def latency(self) -> str:
-        """Median [ms]; empty if the stamps are of another clock."""
-        if not self.latencies:
+    def latency(self, now: float) -> str:
+        """Median [ms]; empty if the stamps are of another clock, or nothing comes any more."""
+        if not self.latencies or self.silent(now) > WINDOW_S:
             return ''
         return f'{1e3 * sorted(self.latencies)[len(self.latencies) // 2]:.0f}'
 
@@ -210,8 +209,8 @@ class LiveStatus:
             said = self._nodes.get(node)
             if said is None or now - said.time > MUTE_S:
                 reasons.append(_silence_of(node))
-            elif said.level == _WARNING and node == _CAMERA and SHUTTER in said.message:
-                continue  # normal operation
+            elif said.level == _WARNING and node == _CAMERA and (SHUTTER in said.message or said.message == FROZEN):
+                continue  # normal operation: a camera that is frozen for longer than a shutter event is stalled
             elif said.level != _OK:
                 reasons.append(said.message if node == _FILTER else f'{node}: {said.message}')
         return reasons
@@ -236,8 +235,8 @@ class LiveStatus:
             LiveFigure('markers in view', in_view if self._frames.silent(now) < WINDOW_S else ''),
             LiveFigure('poses', self._odometry.rate(now), 'Hz'),
             LiveFigure('camera poses', self._camera_pose.rate(now), 'Hz'),
-            LiveFigure('latency', self._odometry.latency, 'ms'),
-            LiveFigure('camera latency', self._camera_pose.latency, 'ms'),
+            LiveFigure('latency', self._odometry.latency(now), 'ms'),
+            LiveFigure('camera latency', self._camera_pose.latency(now), 'ms'),
             LiveFigure('sigma', '' if sigma_m is None else f'{1e3 * sigma_m:.1f}', 'mm'),
             LiveFigure('sigma of attitude', '' if sigma_deg is None else f'{sigma_deg:.2f}', 'deg'),
             LiveFigure('clock offset', f'{offset:.1f} +- {offset_std:.1f}' if known else '', 'ms'),
