@@ -68,8 +68,11 @@
     } else if (!layout.scene && (narrow.matches || touch.matches)) {
       // The buttons are always there, above the plot; what the lines mean stands below it.
       layout.legend = { ...layout.legend, yref: 'container', y: 0, yanchor: 'bottom' };
-      layout.margin.b = narrow.matches ? 134 : 90;
-      layout.height += layout.margin.b - 44;
+      // Entries are 29 px high; on a phone hardly two of them stand side by side.
+      const names = new Set(figure.data.map((trace) => trace.name)).size;
+      const below = 29 * Math.ceil(names / (narrow.matches ? 1 : 4));
+      layout.margin.b += below;
+      layout.height += below;
     }
     const config = { responsive: true, displaylogo: false, displayModeBar: touch.matches ? true : 'hover',
       modeBarButtonsToRemove: ['select2d', 'lasso2d', 'autoScale2d', 'sendChartToCloud', 'sendDataToCloud'], scrollZoom: Boolean(layout.scene) };
