@@ -119,11 +119,13 @@ def _error(evaluation: Evaluation, numbers: dict[str, Any]) -> Remark | None:
         return Remark(Weight.NOTE, 'No ground truth: how large the errors are is not known.')
     if error is None:
         return None
+    share = f'{100 * len(evaluation.fused_errors or ()) / len(evaluation.run.fused):.0f} %'
+    of = '' if share == '100 %' else f' of the {share} of the poses that have one'
     # Nothing speaks for errors that the covariance does not claim.
     return Remark(
         Weight.GOOD if _nees(numbers, 0.0) <= CONSISTENT_NEES else Weight.NOTE,
-        f'Errors against ground truth: {error["position_rms_mm"]:.1f} mm and {error["attitude_rms_deg"]:.2f} deg rms, '
-        f'{error["position_max_mm"]:.0f} mm at the worst, each pose at its own stamp.',
+        f'Errors against ground truth{of}: {error["position_rms_mm"]:.1f} mm and {error["attitude_rms_deg"]:.2f} deg '
+        f'rms, {error["position_max_mm"]:.0f} mm at the worst, each pose at its own stamp.',
     )
 
 

@@ -278,6 +278,15 @@ def test_nothing_speaks_for_errors_that_are_not_claimed(tmp_path, nees, weight):
     assert [remark.weight for remark in remarks if 'against ground truth' in remark.text] == [weight]
 
 
+def test_a_truth_of_a_part_of_the_run_says_how_much(tmp_path):
+    """Errors of the seconds that a tracker had seen were those of the whole run."""
+    run = run_of(tmp_path, trajectory(200.0), trajectory(30.0))
+    seen = (run.truth.stamps_ns >= START_NS + 10**9) & (run.truth.stamps_ns <= START_NS + 4 * 10**9)
+    evaluation = evaluate(replace(run, truth=run.truth.take(seen)))
+    said = ' '.join(remark.text for remark in judge(evaluation, evaluation.numbers()).remarks)
+    assert 'Errors against ground truth of the 25 % of the poses that have one: ' in said
+
+
 def judged(tmp_path, *said, gap=0.0):
     """The verdict on a run without faults in which this was said: (node, level, message, count), once a second.
 
