@@ -76,6 +76,7 @@ def judge(evaluation: Evaluation, numbers: dict[str, Any]) -> RunVerdict:
     """The verdict on a run; ``numbers`` are :meth:`Evaluation.numbers`."""
     made = [
         _output(evaluation, numbers),
+        _start(evaluation),
         _error(evaluation, numbers),
         _truth(evaluation),
         _consistency(numbers),
@@ -111,6 +112,13 @@ def _output(evaluation: Evaluation, numbers: dict[str, Any]) -> Remark:
     if pause > SHORT_PAUSE_MS:
         return Remark(Weight.DOUBT, f'{rate}, with a pause of {pause:.0f} ms.')
     return Remark(Weight.GOOD, f'{rate}, without a pause.')
+
+
+def _start(evaluation: Evaluation) -> Remark | None:
+    fused, markers = evaluation.run.fused.stamps_ns, evaluation.run.fiducial.stamps_ns
+    if not (len(fused) and len(markers)) or (waited_ms := 1e-6 * int(fused[0] - markers[0])) <= LONG_PAUSE_MS:
+        return None
+    return Remark(Weight.NOTE, f'The first pose came {1e-3 * waited_ms:.1f} s after the first one from the markers.')
 
 
 def _error(evaluation: Evaluation, numbers: dict[str, Any]) -> Remark | None:

@@ -89,6 +89,15 @@ def test_an_imu_that_is_silent_at_the_end_is_named_and_no_lost_filter(tmp_path, 
     assert verdict.remarks[0].text == f'200 poses a second, but none in the last {seconds:.1f} s{cause}.'
 
 
+def test_a_filter_that_waits_at_the_start_is_named(tmp_path):
+    """An IMU that began 8 s after the camera: "200 poses a second, without a pause", and nothing else."""
+    every = trajectory(200.0)
+    late = every.take(every.stamps_ns >= START_NS + 8_000_000_000)
+    evaluation = evaluate(run_of(tmp_path, late, trajectory(30.0)))
+    said = [remark.text for remark in judge(evaluation, evaluation.numbers()).remarks]
+    assert 'The first pose came 8.0 s after the first one from the markers.' in said
+
+
 def test_an_imu_that_ends_with_the_recording_is_no_fault(tmp_path):
     summary = {'start_ns': START_NS, 'duration_s': SECONDS, 'last_ns': {'imu/data': START_NS + 11_600_000_000}}
     evaluation = evaluate(run_of(tmp_path, trajectory(200.0), trajectory(30.0), summary=summary))
