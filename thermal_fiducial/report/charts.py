@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.interruptions import GAP_NS
-from thermal_fiducial.report.metrics import CHI2_BAND_6
+from thermal_fiducial.report.metrics import CHI2_BAND_6, PAUSE_NS
 from thermal_fiducial.report.stacked_plots import BAND, Chart, FIDUCIAL, FUSED, GOOD, TimePlots, TRUTH
 
 LATENCY_COLOURS = {'imu_to_pose': FUSED, 'image_to_camera_pose': FIDUCIAL, 'image_to_corrected_pose': '#a855f7'}
@@ -55,7 +55,7 @@ def _draw(plots: TimePlots, row: int, t: FloatArray, values: FloatArray, name: s
     if name == 'markers alone':
         plots.dots(row, t, values, name, FIDUCIAL)
     elif name == 'fused':
-        plots.line(row, t, values, name, FUSED)
+        plots.line(row, t, values, name, FUSED, pause=PAUSE_NS / SECOND_NS)
     else:
         plots.line(row, t, values, name, TRUTH, 3.0)
 

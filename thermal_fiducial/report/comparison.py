@@ -22,6 +22,7 @@ from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import Evaluation
+from thermal_fiducial.report.metrics import PAUSE_NS
 from thermal_fiducial.report.page import evaluate_run
 from thermal_fiducial.report.text_table import number, Table
 from thermal_fiducial.report.trajectory import Trajectory
@@ -193,8 +194,9 @@ def _charts(comparison: Comparison) -> list[Any]:
         if e is None or not len(e):
             continue
         shown, colour = True, _COLOURS[index % len(_COLOURS)]
-        plots.line(1, evaluation.seconds(e.stamps_ns), np.maximum(1e3 * e.position_m, 0.01), name, colour)
-        plots.line(2, evaluation.seconds(e.stamps_ns), np.maximum(e.attitude_deg, 1e-4), name, colour)
+        t, pause = evaluation.seconds(e.stamps_ns), PAUSE_NS / SECOND_NS
+        plots.line(1, t, np.maximum(1e3 * e.position_m, 0.01), name, colour, pause=pause)
+        plots.line(2, t, np.maximum(e.attitude_deg, 1e-4), name, colour, pause=pause)
     plots.make_logarithmic()
     text = 'Fused poses, each at its own stamp, from the beginning of each run.'
     return [Chart('errors', 'Error against ground truth', text, plots.figure, wide=True)] if shown else []

@@ -83,10 +83,15 @@ class TimePlots:
         trace = go.Scatter(**values, name=name, legendgroup=name, showlegend=first, **look)
         self.figure.add_trace(trace, row=row, col=1)
 
-    def line(self, row: int, x: FloatArray, y: FloatArray, name: str, colour: str, width: float = 1.3) -> None:
-        """Add a line of at most :data:`MOST_POINTS`."""
+    def line(
+        self, row: int, x: FloatArray, y: FloatArray, name: str, colour: str, width: float = 1.3, pause: float = np.inf
+    ) -> None:
+        """Add a line of at most :data:`MOST_POINTS`, which ends where ``x`` pauses."""
         shown = thinned(len(x))
-        self.add(row, x[shown], y[shown], name, mode='lines', line={'color': colour, 'width': width})
+        behind = np.flatnonzero(np.diff(x) > pause) + 1
+        at = np.searchsorted(shown, behind)
+        drawn = np.insert(x[shown], at, x[behind]), np.insert(y[shown], at, np.nan)
+        self.add(row, *drawn, name, mode='lines', line={'color': colour, 'width': width})
 
     def dots(self, row: int, x: FloatArray, y: FloatArray, name: str, colour: str, symbol: str = 'circle') -> None:
         """Add at most :data:`MOST_DOTS` dots."""

@@ -25,7 +25,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.report.availability import at_frames, available
-from thermal_fiducial.report.charts import clock_chart, error_charts
+from thermal_fiducial.report.charts import clock_chart, error_charts, pose_charts
 from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.map_error import map_accuracy, marker_errors
 from thermal_fiducial.report.marker_table import tags
@@ -232,6 +232,20 @@ def test_a_marker_quarantined_while_localizing_is_not_used(tmp_path):
     evaluation = evaluate(replace(run, summary={'diagnostics': said, 'mode': 'localization'}))
     assert {tag.id: (tag.status, tag.why) for tag in evaluation.tags}[5] == ('quarantined', '9.1 px off in 30 views')
     assert 'Marker 5 contradicts the map.' in [remark.text for remark in judge(evaluation, GOOD).remarks]
+
+
+@pytest.mark.parametrize('rate_hz', [50.0, 5000.0])
+def test_lines_end_where_there_are_no_poses(tmp_path, rate_hz):
+    """Where the filter was lost for a second a line led on, as if it had known the way."""
+    every = trajectory(rate_hz)
+    away = (every.stamps_ns > START_NS + 4 * 10**9) & (every.stamps_ns < START_NS + 5 * 10**9)
+    evaluation = evaluate(run_of(tmp_path, every.take(~away), trajectory(30.0)))
+    for chart in (*pose_charts(evaluation), *error_charts(evaluation)):
+        line = next(trace for trace in chart.figure.data if trace.name == 'fused')
+        ends = np.flatnonzero(np.isnan(line.y))
+        assert len(ends) == 1
+        assert line.x[ends[0] - 1] <= 4.0 < 4.99 < line.x[ends[0] + 1]
+        assert np.all(np.diff(line.x) >= 0.0)
 
 
 # --- verdict -----------------------------------------------------------------------------------------
