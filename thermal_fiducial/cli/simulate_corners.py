@@ -38,7 +38,7 @@ def simulated_recording(flight: FlightPlan, noise: CornerNoise) -> Recording:
     camera = Camera(lens.width, lens.height, lens.matrix, lens.model, np.array(lens.distortion))
     size = scenario.markers[0].size
     rig = Rig(camera, scenario.T_body_camera, {}, scenario.camera_time_offset, size, scenario.dictionary)
-    return Recording(rig, samples, corners=frames, truth=(stamps, path(times).T_map_body))
+    return Recording(rig, samples, corners=frames, truth=(flight.truth_stamps(), path(times).T_map_body))
 
 
 def write_corner_flight(

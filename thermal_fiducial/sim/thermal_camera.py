@@ -91,6 +91,18 @@ class FlightPlan:
         nanoseconds = np.round(ticks * (SECOND_NS / rate)).astype(np.int64)
         return np.asarray(nanoseconds * 1e-9), nanoseconds + START_NS
 
+    def imu_delay_ns(self) -> int:
+        """How much later than its samples are taken the IMU's stamps are in the mean: its clock is late by that."""
+        if (delivery := self.scenario.imu.delivery) is None:
+            return 0
+        times, _ = self.imu_stamps()
+        kept, stamps = delivery.stamps(times)
+        return round(float(np.mean(stamps - times[kept] * SECOND_NS)))
+
+    def truth_stamps(self) -> IntArray:
+        """Stamps [ns] of the ground truth at the times of the samples, in the IMU's clock."""
+        return self.imu_stamps()[1] + self.imu_delay_ns()
+
 
 def plan(
     scenario: Scenario | str,

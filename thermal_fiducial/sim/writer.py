@@ -144,7 +144,7 @@ def _body_events(flight: FlightPlan) -> Iterator[_Event]:
         ),
         (
             _Event(stamp + IMU_DELAY_NS, TRUTH_TOPIC, messages.odometry(stamp, *state))
-            for stamp, state in zip(stamps.tolist(), truth, strict=True)
+            for stamp, state in zip(flight.truth_stamps().tolist(), truth, strict=True)
         ),
         key=lambda event: event.arrival_ns,
     )
@@ -243,12 +243,12 @@ def _interrupts_ignored() -> Iterator[None]:
 def write_side_files(folder: Path, flight: FlightPlan) -> None:
     """Write ground truth, maps and parameters of a flight into the folder of its bag."""
     scenario = flight.scenario
-    times, stamps = flight.imu_stamps()
+    times, _ = flight.imu_stamps()
     motion = scenario.trajectory(flight.seconds, flight.seed)(times)
-    save_tum(folder / 'ground_truth.tum', stamps.tolist(), motion.position, motion.rotation.as_quat())
+    save_tum(folder / 'ground_truth.tum', flight.truth_stamps().tolist(), motion.position, motion.rotation.as_quat())
     write_text(folder / 'map_true.yaml', _marker_map(scenario, scenario.markers))
     write_text(folder / 'map_one.yaml', _marker_map(scenario, scenario.markers[:1]))
-    save_plain(folder / 'params.yaml', {'/**': {'ros__parameters': _parameters(scenario)}})
+    save_plain(folder / 'params.yaml', {'/**': {'ros__parameters': _parameters(flight)}})
 
 
 def _marker_map(scenario: Scenario, markers: tuple[Marker, ...]) -> str:
@@ -261,8 +261,9 @@ def _marker_map(scenario: Scenario, markers: tuple[Marker, ...]) -> str:
     return dump_document(MapDocument(tuple(entries), MAP_FRAME, scenario.dictionary))
 
 
-def _parameters(scenario: Scenario) -> dict[str, Any]:
+def _parameters(flight: FlightPlan) -> dict[str, Any]:
     """The rig as parameters of the nodes."""
+    scenario = flight.scenario
     sizes = [marker.size for marker in scenario.markers]
     common = max(set(sizes), key=sizes.count)
     overrides = [f'{marker.id}:{marker.size}' for marker in scenario.markers if marker.size != common]
@@ -279,7 +280,7 @@ def _parameters(scenario: Scenario) -> dict[str, Any]:
         'readout_time_std': 0.0,
         'extrinsics_position_std': 0.0,
         'extrinsics_orientation_std': 0.0,
-        'camera_time_offset': float(scenario.camera_time_offset),
+        'camera_time_offset': float(scenario.camera_time_offset + flight.imu_delay_ns() / SECOND_NS),
         **({} if scenario.sensor.lag else {'bolometer_lag': 0.0}),
         **({'readout_time': scenario.sensor.readout} if scenario.sensor.readout else {}),
         'imu': {item.name: getattr(noise, item.name) for item in fields(noise)},

@@ -128,3 +128,18 @@ def test_a_driver_that_reads_now_and_then():
     # What was sampled between two readings of the driver comes with the second, none of it changed.
     lost = (t % 10.0 >= 4.0) & (t % 10.0 < 4.8)
     np.testing.assert_array_equal(readings.angular_velocity, truth.angular_velocity[~lost])
+
+
+def test_the_truth_is_in_the_clock_in_which_the_driver_stamps():
+    """It was 17 ms early for the carpet: of its own ground truth the report said that its clock was another one."""
+    flight = plan('carpet', seed=2)
+    readings = simulate_imu('carpet', seed=2)
+    path = flight.scenario.trajectory(flight.seconds, 2)
+    seconds = (readings.stamps_ns - flight.imu_stamps()[1][0]) * 1e-9
+    offsets = np.arange(0.0, 0.035, 0.001)
+    off = [np.std(readings.angular_velocity - path(seconds - offset).angular_velocity_body) for offset in offsets]
+    late = (flight.truth_stamps() - flight.imu_stamps()[1]) * 1e-9
+    # To a step of the offsets and one more, for the noise of 1600 samples.
+    np.testing.assert_allclose(late, offsets[np.argmin(off)], atol=2e-3)
+    plain = plan('wall')
+    np.testing.assert_array_equal(plain.truth_stamps(), plain.imu_stamps()[1])
