@@ -135,8 +135,13 @@ def widths(quads: FloatArray) -> FloatArray:
 
     Of a square that is turned away about its diagonal all sides stay long, and the opposite ones come near.
     """
+    return np.asarray(areas(quads) / np.sqrt(squared_sides(quads).max(axis=1) + TINY))
+
+
+def areas(quads: FloatArray) -> FloatArray:
+    """Areas (Q,) of quadrilaterals (Q, 4, 2)."""
     (u, v), (w, z) = (quads[:, 2] - quads[:, 0]).T, (quads[:, 3] - quads[:, 1]).T
-    return np.asarray(0.5 * np.abs(u * z - v * w) / np.sqrt(squared_sides(quads).max(axis=1) + TINY))
+    return np.asarray(0.5 * np.abs(u * z - v * w))
 
 
 def diagonals(quads: FloatArray) -> FloatArray:

@@ -1,5 +1,6 @@
 """Markers of the last frame looked for where the motion has carried them, without a map or odometry."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -55,6 +56,24 @@ def test_fast_faint_markers_keep_their_shape():
     # Noise of a tenth of the contrast, doubled by deblurring, makes 0.2 px of 36 px sides; a tail of 4.5 px that passes
     # for a symmetric blur makes a pixel of each.
     assert np.sqrt(np.mean(np.square(errors))) < 0.35
+
+
+def half_of_another(whole, rng):
+    """Marker 30 of 30 px, or its right half alone, which is marker 17 seen from 60 degrees to the side."""
+    image, left = np.full((512, 640), 7000.0), 0 if whole else 15
+    image[90:140, 190 + left : 240] = 7400.0
+    image[100:130, 200 + left : 230] = 7000.0 + 400.0 * np.kron(np.pad(BITS[30], 1), np.ones((5, 5)))[:, left:]
+    return np.rint(cv2.GaussianBlur(image, (0, 0), 0.6) + rng.normal(0.0, 2.0, image.shape)).astype(np.uint16)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_what_resembles_a_half_of_a_marker_is_followed_no_longer_than_until_the_whole_is_seen(seed):
+    """As in a flight through motion blur, where 17 was followed for 1.5 s in the half of 30, which hid the whole."""
+    detector, rng = MarkerDetector(ArucoDetectorConfig(), DICTIONARY), np.random.default_rng(seed)
+    seen = [detector.detect(k * PERIOD_NS, half_of_another(k >= 4, rng), CAMERA)['id'].tolist() for k in range(8)]
+    assert seen[1:4] == [[17]] * 3
+    # A blind search is due every other frame.
+    assert seen[6:] == [[30]] * 2
 
 
 def test_the_second_frame_knows_the_motion_and_sharpens_by_it():

@@ -85,11 +85,13 @@ class FoundMarkers(Stacked):
         """These markers and those of ``others`` with other IDs that do not overlap them."""
         if len(others.ids) == 0:
             return self
-        apart = np.linalg.norm(
-            others.places.points.px.mean(axis=1)[:, None] - self.places.points.px.mean(axis=1), axis=-1
-        )
-        extent = diagonals(self.places.points.px)
-        return self.joined(others.only(~among(others.ids, self.ids) & (apart > TOGETHER * extent).all(axis=1)))
+        return self.joined(others.only(~among(others.ids, self.ids) & ~self.overlap(others).any(axis=0)))
+
+    def overlap(self, others: 'FoundMarkers') -> BoolArray:
+        """Which of these (N,) and of ``others`` (M,) are at one place (N, M)."""
+        mine, theirs = self.places.points.px, others.places.points.px
+        apart = np.linalg.norm(mine.mean(axis=1)[:, None] - theirs.mean(axis=1), axis=-1)
+        return np.asarray(apart <= TOGETHER * diagonals(mine)[:, None])
 
 
 def depths(T_camera_marker: FloatArray, sizes: FloatArray) -> FloatArray:
