@@ -24,11 +24,12 @@ _CLEARLY_APART = 1.1 * APART
 _LARGEST_HALF = math.pi / 2.0
 
 
-def mean_of_two(mean: CameraPose, half: FloatArray, likelier: CameraPose) -> CameraPose:
-    """The mean of two poses whose covariance contains both; the ``likelier`` one if the two are not apart.
+def mean_of_two(mean: CameraPose, half: FloatArray) -> CameraPose:
+    """The mean of two poses whose covariance contains both.
 
-    That one claims to know nothing of turns across the line of sight: from the front the corners do not show about
-    which axis the marker is turned.
+    If the two are not apart, it claims to know nothing of turns across the line of sight: from the front the corners do
+    not show about which axis the marker is turned. Only from the mean, which faces the marker, is each pose that they
+    allow one turn away; from either of the two it is a roll away as well.
 
     Parameters
     ----------
@@ -38,19 +39,16 @@ def mean_of_two(mean: CameraPose, half: FloatArray, likelier: CameraPose) -> Cam
     turn = half[3:]
     squared = float(turn @ turn)
     variance = float(turn @ (mean.covariance - mean.map_covariance)[3:, 3:] @ turn) / squared
-    apart = squared >= max(VAGUE**2, _CLEARLY_APART**2 * variance)
-    pose = mean if apart else likelier
-    ends = (difference(screwed(mean.T_map_camera, step), pose.T_map_camera) for step in (half, -half))
-    spread = 0.5 * sum(map(covariance_of_one_error, ends))
-    if not apart:
+    ends = (difference(screwed(mean.T_map_camera, step), mean.T_map_camera) for step in (half, -half))
+    spread = np.asarray(0.5 * sum(map(covariance_of_one_error, ends)))
+    if squared < max(VAGUE**2, _CLEARLY_APART**2 * variance):
         # The marker is on the axis of the screw. The other unknown turn is about the axis through the marker that is
         # across this one and the line of sight.
         to_axis = np.cross(turn, half[:3]) / squared
         across = np.cross(turn, to_axis) / np.linalg.norm(to_axis)
-        to_pose = lever_arm(pose.T_map_camera[:3, 3] - mean.T_map_camera[:3, 3])
         for unknown in (half, np.concatenate([np.cross(to_axis, across), across])):
-            spread += unknown_turn(to_pose @ unknown)
-    return pose.widened(np.asarray(spread))
+            spread += unknown_turn(unknown)
+    return mean.widened(spread)
 
 
 def possible_poses(pose: CameraPose) -> list[CameraPose]:

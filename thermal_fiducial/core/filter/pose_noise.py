@@ -17,7 +17,7 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import covariance_root
 from thermal_fiducial.core.geometry.plausibility import LEAST_INDEPENDENT
-from thermal_fiducial.core.geometry.se3 import skew, turn_between
+from thermal_fiducial.core.geometry.se3 import screwed, skew, so3_log, turn_between
 from thermal_fiducial.core.measurements import NOTHING_KNOWN
 from thermal_fiducial.core.types import FloatArray
 
@@ -71,19 +71,39 @@ class BodyPose:
         """(6, 6) its derivative by a motion of the map about its origin, in the conventions of ``covariance``."""
         return displacement_of_body(self.T_map_body)
 
+    @cached_property
+    def unknown_turns(self) -> FloatArray:
+        """(6, n) twists of turns that the pose does not show, by a radian each: the position follows such a turn."""
+        turns = self.covariance[:3, :3]
+        if turns.trace() < _UNKNOWN_TURN**2:
+            return np.zeros((6, 0))
+        variances, axes = np.linalg.eigh(turns)
+        unknown = variances > _UNKNOWN_TURN**2
+        return np.asarray(self.covariance[:, :3] @ axes[:, unknown] / variances[unknown])
+
+    def turned_to(self, T_map_body: FloatArray) -> 'BodyPose':
+        """The pose, by turns that it does not show, where the estimate ``T_map_body`` has it.
+
+        It is as likely there. Left where it is, 15 degrees away, an error of the distance to the marker would look like
+        one of the direction, which vanishes if the estimate turns to the pose.
+        """
+        twists = self.unknown_turns
+        if twists.shape[1] == 0:
+            return self
+        rotation = so3_log(self.T_map_body[:3, :3].T @ T_map_body[:3, :3])
+        turn = twists @ (twists[:3].T @ rotation)
+        return replace(self, T_map_body=self.T_map_body @ screwed(np.eye(4), turn[[3, 4, 5, 0, 1, 2]]))
+
     def as_last(self, last: 'BodyPose', T_map_body: FloatArray) -> 'BodyPose':
         """The pose as the one that the next is compared with, seen from ``T_map_body`` of the estimate.
 
-        Of turns that it does not show it has no error of the map either: that of the ``last`` pose stays there, and
-        the position follows such a turn.
+        Of turns that it does not show it has no error of the map either: that of the ``last`` pose stays there.
         """
-        seen, turns = replace(self, T_map_body=T_map_body), self.covariance[:3, :3]
-        if turns.trace() < _UNKNOWN_TURN**2:
+        seen, twists = replace(self, T_map_body=T_map_body), self.unknown_turns
+        if twists.shape[1] == 0:
             return seen
-        variances, axes = np.linalg.eigh(turns)
-        unknown = variances > _UNKNOWN_TURN**2
         stays = np.zeros((6, 6))
-        stays[:, :3] = (self.covariance[:, :3] @ axes[:, unknown] / variances[unknown]) @ axes[:, unknown].T
+        stays[:, :3] = twists @ twists[:3].T
         of_last = np.linalg.solve(seen.by_map, stays @ seen.by_map)
         of_own = np.eye(6) - of_last
         of_map = of_own @ self.map_covariance @ of_own.T + of_last @ last.map_covariance @ of_last.T

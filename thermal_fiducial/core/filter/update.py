@@ -105,6 +105,7 @@ def map_jacobian(state: NavigationState) -> FloatArray:
 
 def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, motion: MotionAtPose) -> Innovation:
     """Innovation of ``pose`` against ``estimate`` at the same instant."""
+    pose = pose.turned_to(estimate.state.T_map_body)
     prior = _propagated_to_markers(config, _propagated_to_view(config, estimate, pose), pose)
     derivative = prior.state.derivative(motion.imu)
     H = np.zeros((6, SIZE))

@@ -158,7 +158,7 @@ def _mean(likelier: Location, less_likely: Location) -> CameraPose:
     mean = likelier.moved(0.5 * screw_difference(T_other, likelier.pose.T_map_camera), np.zeros((6, 6))).pose
     first, other = (pose.covariance - pose.map_covariance for pose in (likelier.pose, less_likely.pose))
     at_own = replace(mean, covariance=0.5 * (first + other) + mean.map_covariance)
-    return mean_of_two(at_own, screw_difference(T_other, mean.T_map_camera), likelier.pose)
+    return mean_of_two(at_own, screw_difference(T_other, mean.T_map_camera))
 
 
 def _cost_of_turn(pose: CameraPose, last: CameraPose) -> float:

@@ -43,7 +43,7 @@ def either(stamp_ns, T_map_body, axis, angle, turn_std=0.02):
     """What the mapper publishes where the pose turned about the marker is possible, too: corners know each to 1 deg."""
     T = about_marker(axis, 0.5 * angle) @ T_map_body @ T_BODY_CAMERA
     mean = by_marker(stamp_ns, T, turn_std)
-    return mean_of_two(mean, screw_difference(T_map_body @ T_BODY_CAMERA, T), mean)
+    return mean_of_two(mean, screw_difference(T_map_body @ T_BODY_CAMERA, T))
 
 
 def flown(axis, angle, speed=0.0, seconds=1.5):
