@@ -196,7 +196,9 @@ class MarkerViews:
         """
         chosen, moved = self._choose_all(starts)
         T, _, cost, _ = self._fitted(starts, chosen, moved)
-        kept = _distinct(T, chosen) & (cost <= REFUTED + TIMES_THE_BEST * cost.min())
+        # The best first: of two that are the same it is the one that stays.
+        order = np.argsort(cost, kind='stable')
+        kept = order[_distinct(T[order], chosen[order]) & (cost[order] <= REFUTED + TIMES_THE_BEST * cost[order[0]])]
         T, of_best = T[kept], chosen[kept][:, [self._best]]
         chosen, moved, _ = self._choose(T, of_best, moved[:, kept])
         T, chi2, cost, weights = self._fitted(T, chosen, moved)
