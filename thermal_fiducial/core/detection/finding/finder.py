@@ -29,7 +29,7 @@ from thermal_fiducial.core.detection.prediction.tracking import Guide, MotionTra
 from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
-from thermal_fiducial.core.geometry.reprojection import areas, diagonals, sides_px
+from thermal_fiducial.core.geometry.reprojection import areas, diagonals, sides_px, squared_sides, widths
 from thermal_fiducial.core.geometry.se3 import turned
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS, TINY
 
@@ -47,6 +47,8 @@ _UNSURE_S = 0.06
 # Markers of the map that are looked for away from their predictions: how many at a time, least width of their cells
 # [px], and how far, as a share of the image's width.
 _MOST, _LEAST_CELL_PX, _FARTHEST = 8, 1.0, 0.25
+# Width of a marker over its longest side below which it may be half of another one: that has 0.5, seen from the front.
+_NARROW = 0.65
 # Least correlation with its pattern of a followed marker, in an image that lag blurs.
 _STILL_SIMILAR = 0.5
 
@@ -128,9 +130,11 @@ class MarkerFinder:
         if (complete or holds) and is_recent:
             return found, history
         scales = _next_scales(history, found, complete=complete)
-        # What no map says is there may be a part of something else.
-        certain = FoundMarkers.none() if guide is None else found.only(among(found.ids, known.ids))
-        blind = self._blind(frame, history, certain, scales, known, unfollowed, config)
+        # Half of another marker may look like a whole one that is turned away: what is narrow is looked at anew, but
+        # where a map says that it is there.
+        corners, is_mapped = found.places.points.px, guide is not None and among(found.ids, known.ids)
+        wide = widths(corners) > _NARROW * np.sqrt(squared_sides(corners).max(axis=1))
+        blind = self._blind(frame, history, found.only(wide | is_mapped), scales, known, unfollowed, config)
         found = self._joined(frame, found, blind)
         if not holds and unfollowed is not None and guide is not None:
             missing = unfollowed.only(~among(unfollowed.ids, found.ids))
