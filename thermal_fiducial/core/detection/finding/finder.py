@@ -29,7 +29,7 @@ from thermal_fiducial.core.detection.prediction.tracking import Guide, MotionTra
 from thermal_fiducial.core.detection.prediction.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
-from thermal_fiducial.core.geometry.reprojection import areas, diagonals, sides_px, squared_sides, widths
+from thermal_fiducial.core.geometry.reprojection import areas, diagonals, sides_px, squared_sides
 from thermal_fiducial.core.geometry.se3 import turned
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS, TINY
 
@@ -133,7 +133,7 @@ class MarkerFinder:
         # Half of another marker may look like a whole one that is turned away: what is narrow is looked at anew, but
         # where a map says that it is there.
         corners, is_mapped = found.places.points.px, guide is not None and among(found.ids, known.ids)
-        wide = widths(corners) > _NARROW * np.sqrt(squared_sides(corners).max(axis=1))
+        wide = areas(corners) > _NARROW * squared_sides(corners).max(axis=1)
         blind = self._blind(frame, history, found.only(wide | is_mapped), scales, known, unfollowed, config)
         found = self._joined(frame, found, blind)
         if not holds and unfollowed is not None and guide is not None:
@@ -203,12 +203,16 @@ class MarkerFinder:
         return FoundMarkers(ids, places, blind.cnr[possible], no, no)
 
     def _joined(self, frame: Frame, found: FoundMarkers, others: FoundMarkers) -> FoundMarkers:
-        """Both, at each place the one that explains more of the image."""
-        contested = found.overlap(others) & (found.ids[:, None] != others.ids)
+        """Both, at each place the one that explains more of the image; of one ID that which was ``found``."""
+        if len(others.ids) == 0:
+            return found
+        together = found.overlap(others)
+        contested = together & (found.ids[:, None] != others.ids)
         if contested.any():
             mine, theirs = self._explained(frame, found), self._explained(frame, others)
-            found = found.only(~(contested & (theirs > mine[:, None])).any(axis=1))
-        return found.and_elsewhere(others)
+            stays = ~(contested & (theirs > mine[:, None])).any(axis=1)
+            found, together = found.only(stays), together[stays]
+        return found.joined(others.only(~among(others.ids, found.ids) & ~together.any(axis=0)))
 
     def _explained(self, frame: Frame, markers: FoundMarkers) -> FloatArray:
         """How many times their patterns shrink the spread of the pixels in N markers, as a logarithm over all pixels.

@@ -81,12 +81,6 @@ class FoundMarkers(Stacked):
         places = Places(ImagePoints(x, x, J, J), np.zeros((0, 4)), np.zeros((0, 4, 2, 6)))
         return FoundMarkers(np.zeros(0, dtype=np.int64), places, np.zeros(0), no, no)
 
-    def and_elsewhere(self, others: 'FoundMarkers') -> 'FoundMarkers':
-        """These markers and those of ``others`` with other IDs that do not overlap them."""
-        if len(others.ids) == 0:
-            return self
-        return self.joined(others.only(~among(others.ids, self.ids) & ~self.overlap(others).any(axis=0)))
-
     def overlap(self, others: 'FoundMarkers') -> BoolArray:
         """Which of these (N,) and of ``others`` (M,) are at one place (N, M)."""
         mine, theirs = self.places.points.px, others.places.points.px
