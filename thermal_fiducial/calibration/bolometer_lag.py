@@ -18,11 +18,10 @@ from thermal_fiducial.core.detection.corners.blurred_patterns import (
     Ages,
     BLUR,
     CORNERS,
-    pattern_grid,
     PatternGrid,
     PatternView,
 )
-from thermal_fiducial.core.detection.corners.pattern_fit import nearness
+from thermal_fiducial.core.detection.corners.pattern_fit import nearness, sample_grid
 from thermal_fiducial.core.detection.corners.pattern_residuals import PatternResiduals, residuals_at
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.geometry.camera import Camera
@@ -43,8 +42,6 @@ _GROUPS = 8
 _OF_FORM = 0.02
 # Lag [s] below which there is none, and standard deviation above which nothing was found: data sheets say as much.
 _NONE_S, _UNKNOWN_S = 0.002, 0.002
-# Least and largest number of samples along a cell, as where corners are fitted.
-_DENSITY = (3, 6)
 # Most steps of a fit, and lengths of its last one: of corners [px], of the lag [s].
 _STEPS, _CONVERGED_PX, _CONVERGED_S = 15, 5e-3, 1e-4
 # Longest steps of corners and blur [px] and of the lag [s]; ranges of blur and lag.
@@ -105,8 +102,8 @@ def calibrate_lag(views: Sequence[MovingMarker], decoder: Decoder, camera: Camer
         for index in chosen:
             if index not in shown:
                 shown[index] = lag_of_view(views[index], decoder, blur_px)
-        used = [index for index in chosen if (view := shown[index]) is not None and view.std < _UNKNOWN_S]
-        result = _combined(speeds[used], np.array([view.lag for index in used if (view := shown[index]) is not None]))
+        lags = {k: view.lag for k in chosen if (view := shown[k]) is not None and view.std < _UNKNOWN_S}
+        result = _combined(speeds[list(lags)], np.array(list(lags.values())))
         lag = max(result.lag, _LAGS_S[0])
     if result.std > _UNKNOWN_S:
         raise InputError(
@@ -195,8 +192,7 @@ class _Model(NamedTuple):
     @staticmethod
     def of(view: MovingMarker, decoder: Decoder, blur_px: float) -> '_Model':
         corners, cells = view.corners_px[None], decoder.cells
-        density = int(np.clip(math.ceil(float(sides_px(corners)[0]) / cells), *_DENSITY))
-        grid = pattern_grid(cells, density, int(nearness(corners, cells, np.array([blur_px]))[0]))
+        grid = sample_grid(sides_px(corners) / cells, cells, int(nearness(corners, cells, np.array([blur_px]))[0]))
         white = decoder.patterns(np.array([view.marker_id]), np.zeros(1, dtype=np.int64))
         return _Model(view, view.counts.astype(np.float32), white, grid)
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.blurred_patterns import lens_bends
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import sides_px
@@ -18,7 +19,7 @@ from thermal_fiducial.core.types import Counts, FloatArray, Gray, SECOND_NS
 from thermal_fiducial.errors import InputError
 
 #: Lag that is usual [s].
-USUAL_LAG_S = 0.010
+USUAL_LAG_S = ArucoDetectorConfig.bolometer_lag
 # Gray levels of pictures for a display: their gain control bends counts, and tails with them.
 _LEVELS = 256
 # Frames that a velocity is taken from, weights of corners in it by all and by the middle three, and share of it that

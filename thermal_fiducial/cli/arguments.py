@@ -21,6 +21,13 @@ def add_remap(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_calibration(parser: argparse.ArgumentParser) -> None:
+    """Option ``--calibration``, for :func:`thermal_fiducial.calibration.sources.camera_of`."""
+    parser.add_argument(
+        '--calibration', type=Path, metavar='FILE', help='camera_info YAML (default: the camera_info of the bag)'
+    )
+
+
 #: The largest seed.
 _MOST = 2**32 - 1
 

@@ -9,7 +9,14 @@ import numpy as np
 
 from thermal_fiducial.calibration.sources import camera_of, clean_frames, imu_track
 from thermal_fiducial.cli import calibrate_intrinsics
-from thermal_fiducial.cli.arguments import add_force, add_remap, file_to_write, refuse_to_overwrite, warn
+from thermal_fiducial.cli.arguments import (
+    add_calibration,
+    add_force,
+    add_remap,
+    file_to_write,
+    refuse_to_overwrite,
+    warn,
+)
 from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import LEAST_ORIENTATION_STD, mapped_detector
 from thermal_fiducial.cli.calibrate_lag import add_lag
@@ -67,9 +74,7 @@ def _add_camera_imu(parser: Parser) -> None:
         help='bag with thermal/image_raw (or markers, their corners) and imu/data, moving before mapped markers',
     )
     parser.add_argument('--map', type=Path, required=True, metavar='FILE', help='marker map (YAML)')
-    parser.add_argument(
-        '--calibration', type=Path, metavar='FILE', help='camera_info YAML (default: the camera_info of the bag)'
-    )
+    add_calibration(parser)
     add_thickness(parser)
     parser.add_argument(
         '--bolometer-lag',

@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.calibration.bolometer_lag import calibrate_lag, LagCalibration
 from thermal_fiducial.calibration.moving_markers import DetectedFrame, moving_markers
 from thermal_fiducial.calibration.sources import camera_of, clean_frames
-from thermal_fiducial.cli.arguments import add_force, add_remap, file_to_write, refuse_to_overwrite
+from thermal_fiducial.cli.arguments import add_calibration, add_force, add_remap, file_to_write, refuse_to_overwrite
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.config import ArucoDetectorConfig
@@ -33,9 +33,7 @@ def add_lag(parser: Parser) -> None:
     parser.add_argument(
         '--map', type=Path, required=True, metavar='FILE', help='marker map (YAML); places do not matter'
     )
-    parser.add_argument(
-        '--calibration', type=Path, metavar='FILE', help='camera_info YAML (default: the camera_info of the bag)'
-    )
+    add_calibration(parser)
     parser.add_argument('--out', type=file_to_write, default=Path('lag.yaml'), help='parameter to write')
     add_force(parser)
     add_remap(parser)

@@ -24,6 +24,7 @@ from thermal_fiducial.core.detection.corners.blurred_patterns import (
     LARGEST_OF_LEVEL,
     LINEAR,
     pattern_grid,
+    PatternGrid,
     PatternView,
     SMALL,
 )
@@ -154,6 +155,12 @@ def nearness(corners_px: FloatArray, cells: int, blurs_px: FloatArray) -> IntArr
     return np.maximum(np.rint(np.log2(np.maximum(apart, 1.0))), 0.0).astype(np.int64)
 
 
+def sample_grid(cell_px: FloatArray, cells: int, nearer: int = 0) -> PatternGrid:
+    """Samples of markers of m x m ``cells``, which are so wide (N,), as ``nearer`` to the lines between cells."""
+    density = max(_FEWEST, math.ceil(float(cell_px.max(initial=0.0)) / _APART_PX))
+    return pattern_grid(cells, min(density, _MOST), nearer)
+
+
 def fitted_patterns(
     frame: Frame,
     found: FoundMarkers,
@@ -196,8 +203,7 @@ def fit_patterns(
     """Fits of the markers ``ids`` (Q,), upright in ``quads`` (Q, 4, 2), which are accurate to half a cell."""
     white, blur = decoder.patterns(ids, np.zeros_like(ids)), np.full(len(ids), blur_px)
     cell = sides_px(quads) / decoder.cells
-    density = max(_FEWEST, math.ceil(float(cell.max(initial=0.0)) / _APART_PX))
-    grid = pattern_grid(decoder.cells, min(density, _MOST), nearer)
+    grid = sample_grid(cell, decoder.cells, nearer)
     prior = _Prior(quads, np.maximum(_START * cell, TINY), blur_px)
     blurs_px = blur_px if view.motion is None else np.hypot(blur_px, np.hypot(*view.motion.T))
     residuals = residuals_at(view, quads.copy(), blur, white, grid)
