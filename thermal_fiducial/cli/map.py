@@ -252,6 +252,9 @@ def _anchor(args: argparse.Namespace) -> int:
         print(f'marker {key}: {1e3 * distance:.1f} mm from its surveyed place; {sides}')
     for key in sorted(surveyed.keys() - result.distances_m.keys()):
         print(f'marker {key}: surveyed, but not in the map')
+    key, std = result.least_known
+    off = f'{1e3 * std:.1f} mm off by the alignment (1 sigma)'
+    print(f'marker {key}: {off}, no other more; no covariance of the map has it')
     for doubt in result.doubts:
         warn(doubt)
 

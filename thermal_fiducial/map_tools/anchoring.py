@@ -2,10 +2,11 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.se3 import apply, rigid_alignment
+from thermal_fiducial.core.geometry.se3 import apply, lever_arm, rigid_alignment
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.core.wording import number_of
@@ -35,6 +36,8 @@ class AnchoredMap:
     map: MarkerMap
     #: distance [m] of each surveyed centre from its place
     distances_m: dict[int, float]
+    #: the marker that an error of the alignment moves most, and the standard deviation [m] of its place by that alone
+    least_known: tuple[int, float]
     #: what may be wrong with the axes of the survey
     doubts: tuple[str, ...]
 
@@ -70,7 +73,22 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> Anchore
         )
     doubts = _doubts_of_axes(T, _is_clearly_closer(distances, mirrored, radius))
     anchored = transformed(marker_map, T)
-    return AnchoredMap(anchored, dict(zip(common, distances.tolist(), strict=True)), tuple(doubts))
+    stds = {
+        key: _std_of_alignment(target, distances, marker.T_map_marker[:3, 3])
+        for key, marker in anchored.markers.items()
+    }
+    least_known = max(stds.items(), key=itemgetter(1))
+    return AnchoredMap(anchored, dict(zip(common, distances.tolist(), strict=True)), least_known, tuple(doubts))
+
+
+def _std_of_alignment(target: FloatArray, distances: FloatArray, place: FloatArray) -> float:
+    """Standard deviation [m] of a ``place`` (3,) by an alignment to ``target`` (N, 3), ``distances`` (N,) away."""
+    centre = target.mean(axis=0)
+    variance = distances @ distances / (3 * len(target) - 6)
+    by_alignment = lever_arm(target - centre)[:, :3]
+    information = (by_alignment.swapaxes(1, 2) @ by_alignment).sum(axis=0)
+    of_place = lever_arm(place - centre)[:3]
+    return float(np.sqrt(variance * np.trace(of_place @ np.linalg.solve(information, of_place.T))))
 
 
 def _distances(T: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
