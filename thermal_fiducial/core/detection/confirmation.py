@@ -20,11 +20,13 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
 # Cells at least this wide are decoded at half resolution, with half the noise and less blur [px].
 _WIDE_CELL_PX = 8.0
-# Least correlation at the refined corners, and where nothing that they show may lower it, or a display may be anything.
-# Everyday textures resemble patterns of few bits: of 19 false positives of four such dictionaries in 100 pictures the
-# best had 0.90. Blur of less than 0.3 cells and noise of 0.05 contrasts leave more than 0.98, warmth that differs by a
-# third from one side of a marker to the other leaves 0.99.
-_SIMILAR, _SIMILAR_IF_CLEAR = 0.82, 0.92
+# Least correlation at the refined corners, and in a clear image of cells so narrow [px] that their edges blur together:
+# of 480 squares of 8 to 14 px with other bits 5 would be markers by 0.82.
+_SIMILAR, _SIMILAR_IF_CLEAR, _NARROW_PX = 0.82, 0.92, 3.0
+# Distance of the edges between cells from where the pattern has them, rms [cells], which nothing in a clear image
+# explains. Rendered markers have less than 0.04, in equalised pictures less than 0.08, through plates of 5 % of their
+# size at 57 deg about 0.15; nine of ten windows in panels that correlate by 0.82 or more have more.
+_OFF_GRID_CELLS = 0.15
 # Least margin over the runner-up, as a share of the marker's isolation. It suffices for dictionaries that correct at
 # least _MANY_BITS wrong bits; noise and clutter often resemble one of the patterns of a 4 x 4 dictionary a little.
 _CLEAR_MARGIN = 0.5
@@ -91,11 +93,14 @@ def _readable(
         tails = lag_tail_places(corners.transpose(2, 0, 1), blur.to_tails).transpose(1, 2, 0)
     reading = _read(frame.image, corners, tails, decoder)
     known = expected & reading.clear(config.guided_min_correlation, config.guided_min_margin)
-    still = np.sqrt(np.sum(blur.spread**2, axis=1)) < _LITTLE / decoder.cells * sides_px(corners)
-    # Neither blur nor noise shows that a pattern might differ by.
+    cell_px = sides_px(corners) / decoder.cells
+    still = np.sqrt(np.sum(blur.spread**2, axis=1)) < _LITTLE * cell_px
+    # Neither blur nor noise moves an edge there.
     sharp = markers.observed.noise < BLURRED_OUT * np.abs(markers.observed.contrast)
     clear = still & (frame.displayed | sharp)
-    similar = np.abs(reading.correlation) >= np.where(clear, _SIMILAR_IF_CLEAR, _SIMILAR)
+    least = np.where(clear & (cell_px < _NARROW_PX), _SIMILAR_IF_CLEAR, _SIMILAR)
+    similar = np.abs(reading.correlation) >= least
+    similar &= ~clear | (decoder.off_grid(frame.image, corners, markers.ids) < _OFF_GRID_CELLS)
     distinct = (similar | (decoder.correctable >= _MANY_BITS)) & _stands_out(reading, decoder)
     # Where the fit found no sides, corners are where it began, and their covariance is that of its prior. What was not
     # expected has passed limits of its surroundings before.

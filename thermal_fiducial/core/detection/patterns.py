@@ -25,6 +25,9 @@ _AT_A_TIME = 256
 _SIMILAR = 0.5
 #: Samples along a cell, in its middle, away from blurred edges.
 CELL_SAMPLES = np.array([0.3, 0.5, 0.7])
+# Samples across an edge between two cells, from its place [cells]. No edge is farther off than that: a bad pixel is.
+_ACROSS = np.arange(-0.45, 0.5, 0.1)
+_FARTHEST = 0.5
 
 
 #: Offsets (9, 2) from a prediction that are tried [cells]; similarity, as a share of the best, that has no weight.
@@ -147,6 +150,7 @@ class Decoder:
         border = self._inner @ detrend
         self._border = border / np.linalg.norm(border)
         self._beside_sides = _beside_sides(self.cells)
+        self._across_edges = _across_edges(self.cells)
         self._samples, means = _cell_samples(self.cells)
         self._cells_of_samples = (means @ detrend).astype(np.float32)
 
@@ -192,6 +196,22 @@ class Decoder:
         values = self._values(image, quads)
         spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), np.float32(TINY))
         return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread, dtype=np.float64)
+
+    def off_grid(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
+        """Distances (Q,) of the edges between cells from where upright markers ``ids`` (Q,) have them, rms [cells].
+
+        By the area under the profile across each: whatever the blur, half of it is on either side of the edge.
+        """
+        counts = _counts_between(image, quads, None, self._across_edges)
+        profiles = counts.reshape(len(quads), len(_ACROSS), len(CELL_SAMPLES), -1).mean(axis=2, dtype=np.float64)
+        steps = np.concatenate([np.diff(self._grids[ids, 0], axis=1), np.diff(self._grids[ids, 1], axis=1)], axis=1)
+        steps = steps.reshape(len(quads), -1)
+        before, behind = profiles[:, 0], profiles[:, -1]
+        edges = np.maximum(np.abs(steps).sum(axis=1), 1.0)
+        contrast = (steps * (behind - before)).sum(axis=1) / edges
+        safe = np.where(np.abs(contrast) < TINY, TINY, contrast)[:, None]
+        off = (profiles.mean(axis=1) - 0.5 * (before + behind)) / safe * np.abs(steps)
+        return np.asarray(np.sqrt((np.clip(off, -_FARTHEST, _FARTHEST) ** 2).sum(axis=1) / edges))
 
     def evidence(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
         """Log-likelihood ratios (Q,) of upright markers ``ids`` (Q,) in quadrilaterals (Q, 4, 2).
@@ -265,6 +285,15 @@ def _cell_samples(cells: int) -> tuple[Float32Array, FloatArray]:
     samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share))).astype(np.float32)
     mean = np.kron(np.eye(cells), np.full((len(CELL_SAMPLES), 1), 1.0 / len(CELL_SAMPLES)))
     return samples, np.asarray(np.kron(mean, mean), dtype=np.float64)
+
+
+def _across_edges(cells: int) -> Float32Array:
+    """Of :func:`bilinear`, (4, P): places across the edges between cells, of a marker and as it is turned once."""
+    along, across = (np.arange(cells) + CELL_SAMPLES[:, None]) / cells, (np.arange(1, cells) + _ACROSS[:, None]) / cells
+    shape = len(_ACROSS), len(CELL_SAMPLES), cells - 1, cells
+    u = np.broadcast_to(along[:, None], shape).reshape(*shape[:2], -1)
+    v = np.broadcast_to(across[:, None, :, None], shape).reshape(*shape[:2], -1)
+    return bilinear(*(np.concatenate(axes, axis=-1).ravel() for axes in ((u, 1.0 - v), (v, u)))).astype(np.float32)
 
 
 def _beside_sides(cells: int) -> Float32Array:

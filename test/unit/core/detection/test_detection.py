@@ -164,14 +164,37 @@ def test_a_pattern_that_is_no_square_in_space_is_no_marker(detector, height, fou
     assert detector.detect(0, counts, camera)['id'].tolist() == found
 
 
-@pytest.mark.parametrize('window', [(30, 15, 46, 39), (18, 7, 41, 25), (26, 21, 54, 45), (33, 21, 45, 45)])
+@pytest.mark.parametrize(('marker_id', 'place'), [(3, (60, 44)), (11, (60, 64)), (20, (80, 64))])
+def test_a_coin_on_a_marker_does_not_hide_it(detector, marker_id, place):
+    """Eight per cent of it are covered, which left a correlation of less than 0.92."""
+    light = np.ones((128, 160), np.float32)
+    cells = np.pad(load_dictionary('DICT_4X4_50').bits[marker_id], 1).astype(np.float32)
+    light[34:94, 50:110] = np.kron(cells, np.ones((10, 10), np.float32))
+    cv2.circle(light, place, 9, 0.0, -1)
+    assert in_small_picture(detector, light) == [marker_id]
+
+
+@pytest.mark.parametrize(
+    'window',
+    [
+        # Correlations of 0.82 to 0.92.
+        *((30, 15, 46, 39), (18, 7, 41, 25), (26, 21, 54, 45), (33, 21, 45, 45)),
+        # Of 0.92 to 1.0: no wrong bit.
+        *((30, 20, 46, 44), (21, 8, 42, 33), (34, 18, 48, 43), (30, 16, 48, 43), (11, 17, 31, 43)),
+    ],
+)
 def test_a_dark_panel_with_a_light_window_is_no_marker(detector, window):
-    """A sharp and clear image does not explain that cells differ from the pattern: correlations of 0.82 to 0.92."""
+    """A sharp and clear image does not explain that edges are elsewhere: all were marker 17."""
     left, top, right, bottom = window
     light = np.ones((128, 160), np.float32)
     light[34:94, 50:110] = 0.0
     light[34 + top : 34 + bottom, 50 + left : 50 + right] = 1.0
+    assert in_small_picture(detector, light) == []
+
+
+def in_small_picture(detector, light):
+    """IDs found in counts of ``light`` (128, 160), 0 to 1."""
     noise = np.random.default_rng(0).normal(0.0, 1.5, light.shape)
     counts = np.rint(7650.0 + 150.0 * cv2.GaussianBlur(light, (0, 0), 0.7) + noise).astype(np.uint16)
     camera = Camera(160, 128, [[112.0, 0, 79.5], [0, 112.0, 63.5], [0, 0, 1]])
-    assert detector.detect(0, counts, camera)['id'].tolist() == []
+    return detector.detect(0, counts, camera)['id'].tolist()
