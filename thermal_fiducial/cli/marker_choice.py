@@ -9,7 +9,7 @@ from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.core.detection.patterns import Dictionary, turned_alike
 from thermal_fiducial.core.wording import listed
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.fabrication.dictionary_search import mirror_images
+from thermal_fiducial.fabrication.dictionary_search import mirror_images, windows
 from thermal_fiducial.files.dictionary import load_dictionary
 
 # No dictionary of the package has more.
@@ -40,12 +40,14 @@ def chosen(args: argparse.Namespace) -> tuple[Dictionary, list[int]]:
     return dictionary, ids
 
 
-def name_mirror_images(dictionary: Dictionary, ids: list[int]) -> None:
-    """Warn of the markers ``ids`` that in a mirror may be read as themselves or one another."""
+def name_look_alikes(dictionary: Dictionary, ids: list[int]) -> None:
+    """Warn of the markers ``ids`` that in a mirror may be read as themselves or one another, or look like a window."""
     pairs = mirror_images(dictionary.bits[ids], dictionary.correctable)
     if pairs:
         read = (f'{ids[a]} as {"itself" if a == b else ids[b]}' for a, b in pairs)
         warn(f'in a mirror (metal, glass, a wet floor) these markers may be read: {listed(read, _MOST_NAMED)}')
+    if plain := [str(ids[k]) for k in windows(dictionary.bits[ids])]:
+        warn(f'a light window in a dark panel may be read as {listed(plain, _MOST_NAMED)}')
 
 
 def _id_list(text: str, count: int, dictionary: str) -> list[int]:

@@ -9,7 +9,7 @@ from shlex import quote
 import numpy as np
 
 from thermal_fiducial.cli.arguments import add_force, refuse_to_overwrite, warn
-from thermal_fiducial.cli.marker_choice import add_choice, chosen, name_mirror_images
+from thermal_fiducial.cli.marker_choice import add_choice, chosen, name_look_alikes
 from thermal_fiducial.cli.parser import Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import BOARD_POINTS, CELLS, LENGTH_MM
@@ -59,7 +59,7 @@ def _make(args: argparse.Namespace) -> int:
     drawings = _markers(dictionary, ids, args)
     _write_all(drawings, args)
     _say_what_is_weak(drawings, args, dictionary.cells)
-    name_mirror_images(dictionary, ids)
+    name_look_alikes(dictionary, ids)
     _say_parameters(args)
     return 0
 
@@ -85,7 +85,7 @@ def _sheet(args: argparse.Namespace) -> int:
     drawings = _markers(dictionary, ids, args)
     _write_all(nest(drawings, width, height, spacing=args.spacing, margin=args.margin), args)
     _say_what_is_weak(drawings, args, dictionary.cells)
-    name_mirror_images(dictionary, ids)
+    name_look_alikes(dictionary, ids)
     _say_parameters(args)
     return 0
 

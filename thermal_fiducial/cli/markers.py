@@ -6,7 +6,7 @@ from shlex import quote
 
 from thermal_fiducial.cli import marker_drawings, marker_planning
 from thermal_fiducial.cli.arguments import add_force, file_to_write, refuse_to_overwrite, whole_number
-from thermal_fiducial.cli.marker_choice import add_choice, chosen, name_mirror_images
+from thermal_fiducial.cli.marker_choice import add_choice, chosen, name_look_alikes
 from thermal_fiducial.cli.parser import add_command, Parser
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.ranges import BITS, HAMMING, LENGTH_MM
@@ -82,7 +82,7 @@ def _check(args: argparse.Namespace) -> int:
             f'these are nearer to a negative than markers to one another ({number_of(least, "bit")}): where warm '
             f'plates in front of a cold surface may appear too, set polarity, or use {signed}, which have none'
         )
-    name_mirror_images(dictionary, ids)
+    name_look_alikes(dictionary, ids)
     apart = f'distance between markers {between}, ' if len(ids) > 1 else 'distance '
     print(f'{good} of {number_of(len(ids), "marker")} can be cut; {apart}to own rotations {own}')
     return 0

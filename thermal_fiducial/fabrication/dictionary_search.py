@@ -247,3 +247,12 @@ def mirror_images(bits: Gray, correctable: int) -> list[tuple[int, int]]:
     """
     pairs = np.argwhere(np.triu(_least_differing(bits[:, :, ::-1], bits) <= correctable))
     return [(int(a), int(b)) for a, b in pairs]
+
+
+def windows(bits: Gray) -> list[int]:
+    """Which of the markers (M, n, n) are a single light rectangle, as a window in a dark panel is."""
+    rows, columns = bits.max(axis=2), bits.max(axis=1)
+    filled = (bits == rows[:, :, None] * columns[:, None, :]).all(axis=(1, 2))
+    # Where light cells begin along either axis.
+    once = [(np.diff(lit.astype(np.int8), axis=1, prepend=0) == 1).sum(axis=1) == 1 for lit in (rows, columns)]
+    return [int(k) for k in np.flatnonzero(filled & once[0] & once[1])]

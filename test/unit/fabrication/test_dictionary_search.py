@@ -150,8 +150,25 @@ def test_chosen_markers_that_may_be_read_in_a_mirror_are_named(capsys, tmp_path)
         'warning: in a mirror (metal, glass, a wet floor) these markers may be read: 6 as itself, 49 as 57\n'
     )
     # Those of the documents' examples.
-    assert main(['markers', 'check', '--mount', 'none', '--ids', '20-27']) == 0
+    assert main(['markers', 'check', '--mount', 'none', '--ids', '23-30']) == 0
     assert capsys.readouterr().err == ''
+
+
+@pytest.mark.parametrize(
+    ('name', 'expected'),
+    [('DICT_4X4_50', [17]), ('STENCIL_4X4_100', [22]), ('STENCIL_4X4_80_SIGNED', [13]), ('STENCIL_5X5_100', [])],
+)
+def test_markers_that_are_a_window_in_a_panel_are_named(name, expected, capsys):
+    """One by one: the light cells fill the rectangle about them."""
+    found = []
+    for marker_id, bits in enumerate(load_dictionary(name).bits):
+        rows, columns = np.nonzero(bits)
+        if len(rows) == (np.ptp(rows) + 1) * (np.ptp(columns) + 1):
+            found.append(marker_id)
+    assert found == expected
+    assert main(['markers', 'check', '--dictionary', name]) == 0
+    named = re.findall(r'a light window in a dark panel may be read as (\d+)', capsys.readouterr().err)
+    assert named == [str(marker_id) for marker_id in expected]
 
 
 def test_check_names_a_marker_that_looks_the_same_upside_down(capsys):
@@ -159,6 +176,7 @@ def test_check_names_a_marker_that_looks_the_same_upside_down(capsys):
     assert capsys.readouterr().err == (
         'warning: marker 1023 of DICT_ARUCO_ORIGINAL looks the same upside down, shows no pose and is not detected\n'
         'warning: in a mirror (metal, glass, a wet floor) these markers may be read: 1023 as itself\n'
+        'warning: a light window in a dark panel may be read as 1023\n'
     )
 
 
