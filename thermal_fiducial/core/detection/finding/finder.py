@@ -31,7 +31,7 @@ from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
 from thermal_fiducial.core.geometry.reprojection import areas, diagonals, sides_px, squared_sides
 from thermal_fiducial.core.geometry.se3 import turned
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS, TINY
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, SECOND_NS
 
 # Polarity: memory in frames that show markers, and the surplus of markers of one polarity from which on it is certain.
 _FRAMES, _SURE = 30.0, 6.0
@@ -47,7 +47,8 @@ _UNSURE_S = 0.06
 # Markers of the map that are looked for away from their predictions: how many at a time, least width of their cells
 # [px], and how far, as a share of the image's width.
 _MOST, _LEAST_CELL_PX, _FARTHEST = 8, 1.0, 0.25
-# Width of a marker over its longest side below which it may be half of another one: that has 0.5, seen from the front.
+# Width of a marker over its longest side below which it may be half of another one, and area over that one's: a half of
+# one that is seen from the front has 0.5 of both.
 _NARROW = 0.65
 # Least correlation with its pattern of a followed marker, in an image that lag blurs.
 _STILL_SIMILAR = 0.5
@@ -135,10 +136,10 @@ class MarkerFinder:
         corners, is_mapped = found.places.points.px, guide is not None and among(found.ids, known.ids)
         wide = areas(corners) > _NARROW * squared_sides(corners).max(axis=1)
         blind = self._blind(frame, history, found.only(wide | is_mapped), scales, known, unfollowed, config)
-        found = self._joined(frame, found, blind)
+        found = _joined(found, blind)
         if not holds and unfollowed is not None and guide is not None:
             missing = unfollowed.only(~among(unfollowed.ids, found.ids))
-            found = self._joined(frame, found, self._drifted(frame, missing, guide, history, config))
+            found = _joined(found, self._drifted(frame, missing, guide, history, config))
         return found, replace(history, searched_ns=frame.stamp_ns, scales=scales)
 
     def _guided(
@@ -170,7 +171,7 @@ class MarkerFinder:
             missing = missing.joined(last.only(lost))
         predictions = len(found.ids) + len(missing.ids)
         if len(missing.ids):
-            found = self._joined(frame, found, near_prediction(frame, missing, self._decoder, config))
+            found = _joined(found, near_prediction(frame, missing, self._decoder, config))
         return found, predictions, unfollowed
 
     def _blind(
@@ -201,27 +202,6 @@ class MarkerFinder:
             places = Places.of(ImagePoints.at(corners - rolling, frame.camera), depth)
         no = np.zeros(len(ids), dtype=bool)
         return FoundMarkers(ids, places, blind.cnr[possible], no, no)
-
-    def _joined(self, frame: Frame, found: FoundMarkers, others: FoundMarkers) -> FoundMarkers:
-        """Both, at each place the one that explains more of the image; of one ID that which was ``found``."""
-        if len(others.ids) == 0:
-            return found
-        together = found.overlap(others)
-        contested = together & (found.ids[:, None] != others.ids)
-        if contested.any():
-            mine, theirs = self._explained(frame, found), self._explained(frame, others)
-            stays = ~(contested & (theirs > mine[:, None])).any(axis=1)
-            found, together = found.only(stays), together[stays]
-        return found.joined(others.only(~among(others.ids, found.ids) & ~together.any(axis=0)))
-
-    def _explained(self, frame: Frame, markers: FoundMarkers) -> FloatArray:
-        """How many times their patterns shrink the spread of the pixels in N markers, as a logarithm over all pixels.
-
-        The right half of marker 30 of DICT_4X4_50 is marker 17, seen from the side: only the whole explains both.
-        """
-        corners = markers.places.points.px + displacement_by_motion(markers.places, frame)
-        correlation = self._decoder.correlation(frame.image, corners, markers.ids)
-        return np.asarray(-areas(corners) * np.log(np.maximum(1.0 - correlation**2, TINY)))
 
     def _drifted(
         self,
@@ -262,6 +242,18 @@ class MarkerFinder:
         if len(wanted) == 0:
             return self._decoder.posed
         return np.asarray(np.isin(np.arange(self._decoder.count), wanted) & self._decoder.posed)
+
+
+def _joined(found: FoundMarkers, others: FoundMarkers) -> FoundMarkers:
+    """Both, at each place that which was ``found`` unless it may be half of the other one.
+
+    The right half of marker 30 of DICT_4X4_50 is marker 17, seen from the side: only the whole explains both.
+    """
+    mine, theirs, together = found.places.points.px, others.places.points.px, found.overlap(others)
+    half = together & (found.ids[:, None] != others.ids) & (areas(mine)[:, None] < _NARROW * areas(theirs))
+    whole = ~half.any(axis=1)
+    found, together = found.only(whole), together[whole]
+    return found.joined(others.only(~among(others.ids, found.ids) & ~together.any(axis=0)))
 
 
 def _next_scales(history: FrameHistory, found: FoundMarkers, *, complete: bool) -> SearchScales:
