@@ -202,10 +202,6 @@ def _at_stamp(
     twist = known
     if frame.twist is not None or known is None:
         measured = MeasuredCorners(ids, at.x, places.depth, deviation)
-        if frame.displayed:
-            # What looks like a small marker may be another thing, unless it has moved as the last frame's should have.
-            sure = refined.evident | ~refined.small | track.explains(frame.stamp_ns, frame.twist, measured)
-            measured = measured.only(sure)
         twist = track.correct(frame.stamp_ns, frame.twist, measured)
     rows = (refined.corners_px + blur.removed)[..., 1]
     lag_blur, rolling = places.lag_blur(twist, frame.lag), rolling_displacement(places, twist, frame, rows)

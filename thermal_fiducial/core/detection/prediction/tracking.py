@@ -17,7 +17,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import interaction
 from thermal_fiducial.core.geometry.se3 import twist_transfer
 from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS, Stacked
+from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
 # Longest time between frames, or from odometry to a frame, over which motion is known well enough to predict by [ns].
 _STALE_NS = 150_000_000
@@ -25,8 +25,6 @@ _STALE_NS = 150_000_000
 _JITTER_S = 0.001
 # Number of coordinates of the corners of a marker.
 _COORDINATES = 8
-# Standard deviations within which a marker has moved as the twist predicts.
-_SIGMAS = 3.0
 # Odometry that gives the twist of a frame: from 3 time constants of the lag before the frame to one after it, a window
 # about the velocity of one time constant before, which causes the blur. Largest number of states; time constant that is
 # assumed without lag [ns].
@@ -36,7 +34,7 @@ _FEWEST, _LONGEST_NS = 4, 100_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class MeasuredCorners(Stacked):
+class MeasuredCorners:
     """Corners of N markers in a frame, by which the camera's motion since the last one is measured.
 
     Parameters
@@ -115,26 +113,6 @@ class MotionTrack:
         information_times_twist = weighted @ moved - share * (stretched @ moved)
         middle_ago = 0.5 * (from_ago + to_ago)
         return updated(start, information, information_times_twist, middle_ago, self.lag - middle_ago)
-
-    def explains(self, stamp_ns: int, predicted: Twist | None, corners: MeasuredCorners) -> BoolArray:
-        """Which markers (N,) were in the last frame, and have moved since as the twist allows.
-
-        Their centres are within three standard deviations of where its covariance and the jitter of stamps allow.
-        """
-        explained = np.zeros(len(corners.ids), dtype=np.bool_)
-        now, before = np.nonzero(corners.ids[:, None] == self.markers.ids)
-        dt = self._since(stamp_ns)
-        if dt is None:
-            return explained
-        twist = predicted or UNKNOWN_TWIST
-        x, x_before = corners.x[now], self.markers.x[before]
-        A = dt * interaction(0.5 * (x + x_before), corners.depth[now]).mean(axis=1)
-        moved = (x - x_before).mean(axis=1)
-        off, jitter = moved - A @ twist.ago(0.5 * dt), math.sqrt(2.0) * _JITTER_S / dt * moved
-        S = A @ twist.covariance @ A.swapaxes(1, 2) + jitter[:, :, None] * jitter[:, None]
-        S += corners.noise[now, None, None] ** 2 * np.eye(2)
-        explained[now] = (off * np.linalg.solve(S, off[..., None])[..., 0]).sum(axis=1) < _SIGMAS**2
-        return explained
 
     def all_clearer_than(self, cnr: float) -> bool:
         """Whether the last frame had markers, all with a contrast-to-noise ratio above ``cnr``."""
