@@ -35,8 +35,9 @@ _NEAR = 3.0
 # Least number of pixels of a segment, three times its unknowns, and of segments; greatest standard deviation of what
 # one shows [blurs].
 _FEWEST_PIXELS, _FEWEST_SEGMENTS, _UNSURE = 12, 8, 0.4
-# Longest step [blurs]: the linearisation holds up to there. Motion beyond as many blurs of the optics shows nothing.
-_LONGEST, _MOST_MOTION = 0.3, 2.0
+# Longest step [blurs]: the linearisation holds up to there. Motion blur [blurs of the optics] beyond which a marker
+# shows little of it: at 0.7 a wrong time constant of the lag makes it 0.17 blurs wider, and 0.3 is what is declared.
+_LONGEST, _MOST_MOTION = 0.3, 0.7
 # Blur [declared ones] from which on the lens counts as out of focus: markers of 24 px are then 0.2 % too large or small
 # where it is taken for declared.
 _OUT_OF_FOCUS = 1.5
