@@ -50,10 +50,10 @@ _END_REACHES = 2.0
 # many standard deviations more. What it is brighter by where something warmer begins: more than a lag tail of motion
 # that is not known makes of it.
 _FADES, _SURE, _WARMER = 0.04, 3.0, 0.2
-# Least number of pixels in each half. Of so many columns, and more, every second one is looked at.
-_FEWEST_PIXELS, _MANY = 6, 12
+# Least number of pixels in each half.
+_FEWEST_PIXELS = 6
 # What pixels are off by, in contrasts, where the model of a side does not hold: even markers leave up to 0.013.
-_MISFIT = 0.02
+_MISFIT = 0.03
 # Motion blur beyond which the end of the surface is not looked for: what lags behind a side fades as well [px].
 _STILL_PX = 0.3
 
@@ -170,29 +170,31 @@ def ending_sides(
     contrast, noise = np.repeat(segments.typical[:, 0], 4), np.repeat(segments.noise.min(axis=1), 4)
     # Where not all of a side is measured, something much warmer is so near that fewer pixels would show that instead.
     measured = segments.variance.reshape(width.shape) < UNMEASURED
-    looked_at: BoolArray = np.asarray(measured.all(axis=1) & np.repeat(motion_px < _STILL_PX, 4))
-    looked_at &= median_of(segments.noise.reshape(width.shape), measured)[:, 0] > (_MISFIT * contrast) ** 2
-    if not looked_at.any():
-        return looked_at.reshape(-1, 4)
+    ends: BoolArray = np.asarray(measured.all(axis=1) & np.repeat(motion_px < _STILL_PX, 4))
+    ends &= median_of(segments.noise.reshape(width.shape), measured)[:, 0] > (_MISFIT * contrast) ** 2
+    which = np.flatnonzero(ends)
+    if len(which) == 0:
+        return ends.reshape(-1, 4)
+    contrast, noise, outward, width = (of_sides[which] for of_sides in (contrast, noise, outward, width))
     # For each part, not for each side: numpy is slow where it repeats the few numbers of a row.
     begins = _WHITE_BEGINS * width
     contrasts = np.repeat(contrast, width.shape[1]).reshape(width.shape)
     limits = np.array([begins, 0.5 * (begins + outward), contrasts], dtype=np.float32)
-    step = 2 if counts.shape[1] >= _MANY else 1
-    outside = -sides.distance[:, ::step]
+    counting, value, outside = (v[:, :, which] for v in (modelled.counting, modelled.value, -sides.distance))
     planes = np.empty((4, *outside.shape), dtype=np.float32)
-    np.multiply(modelled.counting[:, ::step], outside > limits[0], out=planes[0])
+    np.multiply(counting, outside > limits[0], out=planes[0])
     np.multiply(planes[0], outside > limits[1], out=planes[1])
-    rest = counts[:, ::step] - counts[0, 0, 0, 0]
-    rest -= modelled.value[:, ::step] * limits[2]
+    rest = counts[:, :, which] - counts[0, 0, 0, 0]
+    rest -= value * limits[2]
     np.multiply(planes[:2], rest, out=planes[2:])
     # Of all the white, and of its outer half. A product of matrices adds up three times as fast as a sum.
-    moments = np.ones(outside[:, :, 0, 0].size, dtype=np.float32) @ planes.reshape(4, -1, modelled.value[0, 0].size)
-    white, outer, white_sum, outer_sum = moments.reshape(4, *modelled.value.shape[2:]).sum(axis=2)
+    moments = np.ones(outside[:, :, 0, 0].size, dtype=np.float32) @ planes.reshape(4, -1, value[0, 0].size)
+    white, outer, white_sum, outer_sum = moments.reshape(4, *value.shape[2:]).sum(axis=2)
     number = np.array([outer, white - outer])
     level = np.array([outer_sum, white_sum - outer_sum]) / np.maximum(number, 1)
     variance = noise * (1.0 / np.maximum(number, 1)).sum(axis=0)
     darker, unsure = (level[1] - level[0]) * np.sign(contrast), _SURE * np.sqrt(variance)
-    ends = (darker > _FADES * np.abs(contrast) + unsure) | (-darker > _WARMER * np.abs(contrast) + unsure)
+    fades = (darker > _FADES * np.abs(contrast) + unsure) | (-darker > _WARMER * np.abs(contrast) + unsure)
     judged = (number >= _FEWEST_PIXELS).all(axis=0) & (outward > _LEAST_WHITE * width).all(axis=1)
-    return np.asarray((ends & judged & looked_at).reshape(-1, 4))
+    ends[which] = fades & judged
+    return ends.reshape(-1, 4)
