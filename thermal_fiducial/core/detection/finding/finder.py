@@ -24,6 +24,7 @@ from thermal_fiducial.core.detection.prediction.known_markers import (
     ExpectedMarkers,
     FoundMarkers,
     KnownMarkers,
+    TOGETHER,
 )
 from thermal_fiducial.core.detection.prediction.tracking import Guide, MotionTrack
 from thermal_fiducial.core.detection.prediction.twist import Twist
@@ -249,7 +250,9 @@ def _joined(found: FoundMarkers, others: FoundMarkers) -> FoundMarkers:
 
     The right half of marker 30 of DICT_4X4_50 is marker 17, seen from the side: only the whole explains both.
     """
-    mine, theirs, together = found.places.points.px, others.places.points.px, found.overlap(others)
+    mine, theirs = found.places.points.px, others.places.points.px
+    apart = np.linalg.norm(mine.mean(axis=1)[:, None] - theirs.mean(axis=1), axis=-1)
+    together = apart <= TOGETHER * diagonals(mine)[:, None]
     half = together & (found.ids[:, None] != others.ids) & (areas(mine)[:, None] < _NARROW * areas(theirs))
     whole = ~half.any(axis=1)
     found, together = found.only(whole), together[whole]

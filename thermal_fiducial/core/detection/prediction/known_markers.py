@@ -8,7 +8,7 @@ import numpy as np
 from thermal_fiducial.core.detection.prediction.frame import LEAST_DEPTH, Places
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, diagonals, marker_corners, squared_sides
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners, squared_sides
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
 
 #: Distance from the image's border [px] below which an unrefined marker counts as possibly cut off.
@@ -80,12 +80,6 @@ class FoundMarkers(Stacked):
         x, J, no = np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros(0, dtype=bool)
         places = Places(ImagePoints(x, x, J, J), np.zeros((0, 4)), np.zeros((0, 4, 2, 6)))
         return FoundMarkers(np.zeros(0, dtype=np.int64), places, np.zeros(0), no, no)
-
-    def overlap(self, others: 'FoundMarkers') -> BoolArray:
-        """Which of these (N,) and of ``others`` (M,) are at one place (N, M)."""
-        mine, theirs = self.places.points.px, others.places.points.px
-        apart = np.linalg.norm(mine.mean(axis=1)[:, None] - theirs.mean(axis=1), axis=-1)
-        return np.asarray(apart <= TOGETHER * diagonals(mine)[:, None])
 
 
 def depths(T_camera_marker: FloatArray, sizes: FloatArray) -> FloatArray:
