@@ -26,8 +26,6 @@ from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.two_poses import DECISIVE, possible_poses, unknown_turn
 from thermal_fiducial.core.types import SECOND_NS
 
-#: A propagated belief is kept at this interval [ns], so that a pose begins there and not at the pose before.
-_KEPT_EVERY_NS = 10_000_000
 #: Standard deviation of a suspected step of the IMU's clock as a share of its size: the clock has stepped by all of it,
 #: or samples are lost and it has not stepped, with equal odds.
 _STEP_OR_LOSS = 0.5
@@ -56,7 +54,7 @@ class History:
         self._offset_ns = round(camera_time_offset * SECOND_NS)
         self.imu, self.log = ImuBuffer(), PoseLog()
         self._poses: list[CameraPose] = []
-        #: after each pose, and behind it the same one propagated, with the same verdict; the first is before all poses
+        #: after each pose; the first is before all poses that may still be inserted
         self._beliefs = [Belief()]
         #: suspected steps of the camera's clock [ns], by the stamp of the first pose behind them
         self._camera_steps: dict[int, int] = {}
@@ -160,21 +158,17 @@ class History:
     def take_in(self) -> None:
         """Apply all poses up to the newest sample, log the verdicts on them, and propagate to that sample."""
         while (pose := self._next_due()) is not None:
-            self._undo_propagation_beyond(pose)
             belief = belief_after(self, pose)
             if self._relinearise(belief):
                 continue
             self._beliefs.append(belief)
             self.main = belief.main
             self.log.add(belief.verdict)
-        newest_ns, belief = self.imu.newest_ns, self.belief
+        newest_ns = self.imu.newest_ns
         if self.stepped:
             self.stepped = self.carried(self.stepped, newest_ns)
-        if self.main and belief.main:
+        if self.main:
             self.main = self.carried(self.main, newest_ns)
-            if newest_ns - belief.main.estimate.stamp_ns >= _KEPT_EVERY_NS:
-                other = belief.alternative and self.carried(belief.alternative, newest_ns)
-                self._beliefs.append(belief._replace(main=self.main, alternative=other))
         # Half of the buffer at a time: each removal moves the rest.
         if newest_ns - self.imu.oldest_ns > 2 * self._kept_ns:
             self._forget_old()
@@ -189,13 +183,6 @@ class History:
         begin_ns = self.due_ns(pose, None, belief.first_offset)
         due_ns = max((self.due_ns(pose, h) for h in belief.hypotheses), default=begin_ns)
         return pose if due_ns <= self.imu.newest_ns else None
-
-    def _undo_propagation_beyond(self, pose: CameraPose) -> None:
-        """Remove beliefs that were only propagated, without a pose, beyond the instant of ``pose``."""
-        while len(self._beliefs) > 1 and self._beliefs[-2].verdict is self.belief.verdict:
-            if all(h.estimate.stamp_ns <= self.due_ns(pose, h) for h in self.belief.hypotheses):
-                return
-            del self._beliefs[-1]
 
     def _relinearise(self, belief: Belief) -> bool:
         """Return to before an initialisation that ends with ``belief`` if it must begin once more; whether it must.
@@ -267,16 +254,14 @@ class History:
     def _forget_old(self) -> None:
         """Remove what is older than any pose that may still be inserted."""
         horizon_ns = self.imu.newest_ns - self._kept_ns
-        if self.belief.stamp_ns < horizon_ns and self.belief.main is None:
-            # Initialising, and no pose for that long: only the hypothesis carried to the earliest next one is needed.
-            hypotheses = self.belief.alternative, self.belief.second
-            other, second = (hypothesis and self.carried(hypothesis, horizon_ns) for hypothesis in hypotheses)
-            self._beliefs = [self.belief._replace(alternative=other, second=second)]
         while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
             del self._beliefs[0]
         oldest = self._beliefs[0]
+        hypotheses = oldest.main, oldest.alternative, oldest.second
+        main, other, second = (hypothesis and self.carried(hypothesis, horizon_ns) for hypothesis in hypotheses)
+        self._beliefs[0] = oldest._replace(main=main, alternative=other, second=second)
         del self._poses[: bisect_right(self._poses, oldest.verdict.stamp_ns, key=_stamp)]
-        self.imu.forget_before(min(horizon_ns, oldest.stamp_ns) if oldest.hypotheses else horizon_ns)
+        self.imu.forget_before(horizon_ns)
         kept = {pose.stamp_ns for pose in self._poses}
         self._camera_steps = {stamp: step for stamp, step in self._camera_steps.items() if stamp in kept}
         self._imu_steps = [step for step in self._imu_steps if step[0] >= self.imu.oldest_ns]
