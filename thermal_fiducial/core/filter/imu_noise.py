@@ -1,5 +1,6 @@
 """How noisy the IMU is now: by its data sheet, under vibration, in motion, over gaps and at the end of its range."""
 
+from collections import deque
 import math
 
 import numpy as np
@@ -33,10 +34,8 @@ _BIAS_SHOWS = 1.0
 #: Number of bands, and their lowest and highest frequency [Hz]: above the motion, below the IMU's own low-pass filter.
 #: The quietest band is the floor of the spectrum: rotor tones leave at least one band nearly untouched.
 _BANDS, _LOWEST, _HIGHEST = 4, 12.5, 50.0
-#: Length of a window [s], number of windows that overlap at any time, windows in the running mean.
-_WINDOW, _OVERLAPPING, _MEAN_OF = 0.32, 4, 12
-#: Change of the mean step beyond which samples come at another rate: bursts and lost samples change it by less.
-_OTHER_RATE = 1.3
+#: Length of a window [s], number of windows that overlap at any time, windows in the mean.
+_WINDOW, _OVERLAPPING, _MEAN_OF = 0.32, 4, 20
 
 
 def bias_walks(noise: ImuNoise) -> tuple[float, float]:
@@ -174,65 +173,41 @@ class NoiseFloor:
 
     def __init__(self) -> None:
         self._samples: list[FloatArray] = []
-        #: of each of them the time since the one before, and the mean that the window is for [s]
+        #: of each of them the time since the one before [s]
         self._seconds: list[float] = []
-        self._step = 0.0
-        self._window = self._bands = np.zeros((0, 1))
-        self._power = np.zeros((1, 2))
-        self._windows = 0
+        #: (_BANDS, 2) squared densities of rate and force of the latest windows
+        self._powers: deque[FloatArray] = deque(maxlen=_MEAN_OF)
         #: gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]; 0 until the first window is full
         self.densities = (0.0, 0.0)
 
     def add(self, imu: FloatArray, seconds: float) -> None:
         """Add a sample (6,) that follows the last one after ``seconds``; one behind a gap begins a new window."""
         if seconds > _GAP:
-            self._begin()
+            self._samples.clear()
+            self._seconds.clear()
         self._samples.append(imu)
         self._seconds.append(seconds)
-        differences = len(self._samples) - 2
-        if not len(self._window) and sum(self._seconds[2:]) >= _WINDOW:
-            self._prepare(differences)
-        if 0 < len(self._window) <= differences:
-            self._measure_or_begin(differences)
-
-    def _measure_or_begin(self, differences: int) -> None:
-        """Measure a full window; where the rate has changed, begin with one for the new rate."""
-        change = sum(self._seconds[2:]) / differences / self._step
-        if 1.0 / _OTHER_RATE < change < _OTHER_RATE:
+        if len(self._samples) > 2 and sum(self._seconds[2:]) >= _WINDOW:
             self._measure()
-            old = max(differences // _OVERLAPPING, 1)
+            old = len(self._samples) // _OVERLAPPING
             del self._samples[:old], self._seconds[:old]
-        else:
-            self._window = self._window[:0]
-            self._begin()
-
-    def _begin(self) -> None:
-        self._samples.clear()
-        self._seconds.clear()
-
-    def _prepare(self, count: int) -> None:
-        """Window of ``count`` differences and bands, for the rate that the samples turn out to have."""
-        self._step = seconds = sum(self._seconds[2:]) / count
-        frequencies = np.fft.rfftfreq(count, seconds)
-        edges = np.linspace(_LOWEST, min(_HIGHEST, 0.5 / seconds), _BANDS + 1)
-        inside = (frequencies >= edges[:-1, None]) & (frequencies < edges[1:, None])
-        inside = inside[inside.any(axis=1)]
-        self._window = np.hanning(count + 1)[:-1, None]
-        # Power of second differences to squared density of the samples.
-        gain = 4.0 * np.sin(np.pi * frequencies * seconds) ** 2
-        scale = seconds / (np.maximum(gain, TINY) ** 2 * (self._window**2).sum())
-        # Slow samples have fewer bands: those of another rate are not their mean.
-        self._windows, self._power = 0, np.zeros((len(inside), 2))
-        self._bands = inside / inside.sum(axis=1, keepdims=True) * scale
 
     def _measure(self) -> None:
         """Take the spectrum of a full window into the mean, and the noise densities from its quietest band."""
         samples = np.array(self._samples)
         differences = samples[:-2] - 2.0 * samples[1:-1] + samples[2:]
-        spectrum = np.abs(np.fft.rfft(differences * self._window, axis=0)) ** 2
-        power = (self._bands @ spectrum).reshape(-1, 2, 3).sum(axis=2) / 3.0
-        self._windows = min(self._windows + 1, _MEAN_OF)
-        self._power = self._power + (power - self._power) / self._windows
-        if len(power):
-            rate, force = np.sqrt(self._power.min(axis=0)).tolist()
-            self.densities = rate, force
+        count = len(differences)
+        seconds = sum(self._seconds[2:]) / count
+        frequencies, window = np.fft.rfftfreq(count, seconds), np.hanning(count + 1)[:-1, None]
+        spectrum = np.abs(np.fft.rfft(differences * window, axis=0)) ** 2
+        # Power of second differences to squared density of the samples.
+        gain = 4.0 * np.sin(np.pi * frequencies * seconds) ** 2
+        scale = seconds / (np.maximum(gain, TINY) ** 2 * (window**2).sum())
+        power = (scale[:, None] * spectrum).reshape(-1, 2, 3).mean(axis=2)
+        edges = np.linspace(_LOWEST, max(min(_HIGHEST, 0.5 / seconds), _LOWEST), _BANDS + 1)
+        inside = (frequencies >= edges[:-1, None]) & (frequencies < edges[1:, None])
+        counts = inside.sum(axis=1, keepdims=True)
+        # Slow samples have fewer bands.
+        self._powers.append(np.where(counts > 0, inside @ power / np.maximum(counts, 1), np.inf))
+        rate, force = np.sqrt(np.mean(self._powers, axis=0).min(axis=0)).tolist()
+        self.densities = (rate, force) if math.isfinite(rate) else (0.0, 0.0)
