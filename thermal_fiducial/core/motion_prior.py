@@ -29,8 +29,6 @@ LOST_M = 30.0
 MAX_AGE = 0.3
 # A stamp farther back [ns] is not of a message that was overtaken: the clock was set, and all before is of another one.
 _REORDERED_NS = 100_000_000
-# Largest delay of frames, for which states are kept [ns].
-_KEPT_NS = 500_000_000
 # Largest number of states: two seconds of odometry at 1 kHz.
 _MOST = 2000
 
@@ -82,12 +80,8 @@ class MotionPrior:
             return
         self._stamps_ns.insert(place, stamp_ns)
         self._states.insert(place, state)
-        # Bounds the memory for odometry whose stamps hardly advance.
         if len(self._stamps_ns) > _MOST:
             del self._stamps_ns[: _MOST // 2], self._states[: _MOST // 2]
-        if self._stamps_ns[-1] - self._stamps_ns[0] > 2 * _KEPT_NS:
-            old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - _KEPT_NS)
-            del self._stamps_ns[:old], self._states[:old]
 
     def nearest(self, stamp_ns: int) -> Odometry | None:
         """The state whose stamp, in the clock of the odometry, is nearest."""
