@@ -43,14 +43,12 @@ class MotionAtPose:
     Attributes
     ----------
     imu : (6,) mean of equally many samples before and after it: a one-sided mean would bias the clock offset
-    rate_variance : variance of one axis of the mean rate [rad^2/s^2]
     turning : magnitude of the angular acceleration [rad/s^2]
     white : (6,) variances by white noise alone, of the mean rate [rad^2/s^2] and of what that of the accelerometer has
         added to the velocity since the last accepted pose [m^2/s^2]
     """
 
     imu: FloatArray
-    rate_variance: float
     turning: float
     white: FloatArray
 
@@ -152,7 +150,6 @@ class ImuBuffer:
         since_accepted = (time_ns - accepted_ns) / SECOND_NS
         return MotionAtPose(
             imu=imu[first:end].mean(axis=0),
-            rate_variance=float(self._rows[index, 1, 0]) ** 2 / (seconds * (end - first)),
             turning=float(np.linalg.norm(imu[index, :3] - imu[index - 1, :3])) / seconds,
             white=np.repeat((of_rate**2 / white_seconds, of_force**2 * since_accepted), 3),
         )

@@ -232,7 +232,7 @@ def _in_map_of_markers(estimate: Estimate) -> Estimate:
 
 
 def _second_order_of_clock(prior: Estimate, motion: MotionAtPose, derivative: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of the second order: clock offset times the errors of rate and velocity, and its square.
+    """Covariance (6, 6) of the second order: clock offset times the error of the velocity, and its square.
 
     The square enters by half of the acceleration.
     """
@@ -242,7 +242,7 @@ def _second_order_of_clock(prior: Estimate, motion: MotionAtPose, derivative: Fl
     with_velocity, variance = P[VELOCITY, TIME_OFFSET], float(P[TIME_OFFSET, TIME_OFFSET])
     square = 0.75 * variance**2
     R = np.zeros((6, 6))
-    R[_SIX[:3], _SIX[:3]] = variance * motion.rate_variance + square * motion.turning**2
+    R[_SIX[:3], _SIX[:3]] = square * motion.turning**2
     R[_SIX[3:], _SIX[3:]] = square * float(acceleration @ acceleration)
     R[3:, 3:] += variance * P[VELOCITY, VELOCITY] + np.outer(with_velocity, with_velocity)
     return R

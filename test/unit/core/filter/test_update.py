@@ -48,7 +48,7 @@ def motion_of(state, rate=RATE, acceleration=(0.0, 0.0, 0.0), **others):
     force = acceleration - gravity + np.cross(rate, state.velocity_body)
     wanted = np.concatenate((rate, force)) + state.bias
     imu = np.linalg.solve(np.eye(3) - state.scale, wanted.reshape(2, 3, 1)).reshape(6)
-    return MotionAtPose(**({'imu': imu, 'rate_variance': 0.0, 'turning': 0.0, 'white': np.zeros(6)} | others))
+    return MotionAtPose(**({'imu': imu, 'turning': 0.0, 'white': np.zeros(6)} | others))
 
 
 @pytest.fixture
