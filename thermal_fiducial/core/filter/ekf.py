@@ -101,7 +101,8 @@ class PoseEkf:
         imu, buffer = np.concatenate((sample.angular_velocity, sample.linear_acceleration)), self._history.imu
         seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS
         densities = self._noise.densities(imu, seconds) if len(buffer) else np.zeros(6)
-        buffer.append(sample.stamp_ns, imu, densities, self._noise.white)
+        buffer.append(sample.stamp_ns, imu, densities)
+        buffer.white = self._noise.white
         return True
 
     def add_pose(self, pose: CameraPose) -> PoseUpdate:

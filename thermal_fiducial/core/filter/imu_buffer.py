@@ -25,15 +25,11 @@ class Steps(NamedTuple):
 
 
 class LastSample(NamedTuple):
-    """The newest sample ``imu`` (6,); ``seconds`` and noise ``densities`` (6,) of the step that ends with it.
-
-    ``white`` (2,): densities of the white noise of rate and force alone.
-    """
+    """The newest sample ``imu`` (6,); ``seconds`` and noise ``densities`` (6,) of the step that ends with it."""
 
     imu: FloatArray
     seconds: float
     densities: FloatArray
-    white: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,32 +58,31 @@ class ImuBuffer:
         self._rows = np.zeros((_CAPACITY, 2, 6))
         #: stamps of the last sample and of the first one that is kept; 0 before the first
         self.newest_ns = self.oldest_ns = 0
-        self.last = LastSample(np.zeros(6), math.inf, np.zeros(6), (0.0, 0.0))
+        self.last = LastSample(np.zeros(6), math.inf, np.zeros(6))
+        #: present densities of the white noise of rate and force alone
+        self.white = (0.0, 0.0)
 
     def __len__(self) -> int:
         """Number of samples."""
         return len(self._stamps_ns)
 
-    def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray, white: tuple[float, float]) -> None:
-        """Add a sample (6,) and the noise densities (6,) of the step that ends with it; gaps are interpolated.
-
-        ``white``: densities of the white noise of rate and force alone.
-        """
+    def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
+        """Add a sample (6,) and the noise densities (6,) of the step that ends with it; gaps are interpolated."""
         place = len(self._stamps_ns)
         if place == 0:
             self.oldest_ns = stamp_ns
         elif stamp_ns - self.newest_ns > GAP_NS:
-            self._fill_gap(stamp_ns, imu, densities, white)
+            self._fill_gap(stamp_ns, imu, densities)
             place = len(self._stamps_ns)
         if place == len(self._rows):
             self._rows = np.concatenate((self._rows, np.zeros_like(self._rows)))
         self._stamps_ns.append(stamp_ns)
         self._rows[place, 0], self._rows[place, 1] = imu, densities
         seconds = (stamp_ns - self.newest_ns) / SECOND_NS if place else math.inf
-        self.last = LastSample(imu, seconds, densities, white)
+        self.last = LastSample(imu, seconds, densities)
         self.newest_ns = stamp_ns
 
-    def _fill_gap(self, stamp_ns: int, imu: FloatArray, densities: FloatArray, white: tuple[float, float]) -> None:
+    def _fill_gap(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
         """Interpolate between the newest sample and the next one, ``imu`` (6,) at ``stamp_ns``.
 
         Over a gap the error of rate and force is noise, not a constant.
@@ -96,7 +91,7 @@ class ImuBuffer:
         parts = -((begin_ns - stamp_ns) // GAP_NS)
         for part in range(1, parts):
             part_ns = begin_ns + (stamp_ns - begin_ns) * part // parts
-            self.append(part_ns, begin + part / parts * (imu - begin), densities, white)
+            self.append(part_ns, begin + part / parts * (imu - begin), densities)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Remove samples before ``stamp_ns``, except the last one, which interpolation needs."""
@@ -146,7 +141,7 @@ class ImuBuffer:
         first, end = index - each_side, index + each_side
         # For as many steps as there are samples.
         white_seconds = (stamps_ns[end - 1] - stamps_ns[first]) / SECOND_NS * (end - first) / (end - first - 1)
-        of_rate, of_force = self.last.white
+        of_rate, of_force = self.white
         since_accepted = (time_ns - accepted_ns) / SECOND_NS
         return MotionAtPose(
             imu=imu[first:end].mean(axis=0),

@@ -28,7 +28,7 @@ def history(until, poses, *, seconds=4.0, force=1.0):
     flight, kept = Flight(seed=1, seconds=seconds, motion=Motion.still()), History(CONFIG, 0.0)
     for sample in flight.samples()[: round(until * RATE)]:
         imu = np.concatenate((sample.angular_velocity, force * sample.linear_acceleration))
-        kept.imu.append(sample.stamp_ns, imu, np.repeat((1.7e-4, 2e-3), 3), (1.7e-4, 2e-3))
+        kept.imu.append(sample.stamp_ns, imu, np.repeat((1.7e-4, 2e-3), 3))
     for pose in flight.poses[poses]:
         kept.insert(pose)
     kept.take_in()

@@ -15,7 +15,7 @@ def test_a_start_without_further_poses_keeps_no_more_than_a_flight_does():
     coming = [flight.poses[10]]
     for sample in flight.samples():
         imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
-        history.imu.append(sample.stamp_ns, imu, np.full(6, 1e-3), (1e-3, 1e-3))
+        history.imu.append(sample.stamp_ns, imu, np.full(6, 1e-3))
         if coming and sample.stamp_ns > coming[0].stamp_ns:
             history.insert(coming.pop())
         history.take_in()

@@ -25,7 +25,7 @@ def line(time_ns):
 def buffer():
     buffer = ImuBuffer()
     for stamp_ns, densities in zip(STAMPS_NS, DENSITIES, strict=True):
-        buffer.append(stamp_ns, line(stamp_ns), densities, WHITE)
+        buffer.append(stamp_ns, line(stamp_ns), densities)
     return buffer
 
 
@@ -65,7 +65,7 @@ def test_a_window_ends_at_its_instant(buffer):
 def test_it_grows_and_forgets():
     buffer = ImuBuffer()
     for index in range(5000):
-        buffer.append(index, line(index), np.ones(6), WHITE)
+        buffer.append(index, line(index), np.ones(6))
         if index % 100 == 0:
             buffer.forget_before(index - 1500)
     # the one before 3400, as an instant between the two may be asked for
@@ -76,7 +76,7 @@ def test_it_grows_and_forgets():
 
 def test_a_gap_is_filled_with_short_steps_of_its_own_noise(buffer):
     begin_ns, end_ns = STAMPS_NS[-1], STAMPS_NS[-1] + 100_000_000
-    buffer.append(end_ns, line(end_ns), 9.0 * np.ones(6), WHITE)
+    buffer.append(end_ns, line(end_ns), 9.0 * np.ones(6))
     steps = buffer.steps(begin_ns, end_ns)
     # four of 25 ms: more than 30 ms would be one of its parts with three
     np.testing.assert_allclose(steps.seconds, 0.025)
@@ -87,8 +87,8 @@ def test_a_gap_is_filled_with_short_steps_of_its_own_noise(buffer):
 def test_one_pose_behind_a_gap_does_not_make_the_velocity_known():
     # The hidden acceleration may have come early or late in the gap.
     gap = ImuBuffer()
-    gap.append(0, np.zeros(6), np.ones(6), WHITE)
-    gap.append(500_000_000, np.zeros(6), np.ones(6), WHITE)
+    gap.append(0, np.zeros(6), np.ones(6))
+    gap.append(500_000_000, np.zeros(6), np.ones(6))
     known = replace(any_estimate(), stamp_ns=0, covariance=np.zeros((SIZE, SIZE)))
     noise = propagated(known, gap.steps(0, 500_000_000), 500_000_000, np.zeros(SIZE)).covariance
     velocity, position = noise[5, 5], noise[8, 8]
@@ -101,10 +101,11 @@ def test_the_motion_at_a_pose_has_the_white_noise_of_its_samples():
     """Of a gyroscope and an accelerometer that are nothing but noise, by its spread over many instants."""
     rng, step_ns, accepted_ns = np.random.default_rng(2), 5_000_000, 40_000_000
     noisy = ImuBuffer()
+    noisy.white = WHITE
     samples = rng.normal(size=(20_000, 6)) * np.repeat(WHITE, 3) / np.sqrt(1e-9 * step_ns)
     for index, sample in enumerate(samples):
         # what poses claim beside it says nothing of the noise
-        noisy.append(index * step_ns, sample, np.ones(6), WHITE)
+        noisy.append(index * step_ns, sample, np.ones(6))
     at = [noisy.motion(ns, ns - accepted_ns) for ns in range(1_000_000_000, 99_000_000_000, 100_000_000)]
     spread = np.var([motion.imu[:3] for motion in at])
     # 3 x 980 independent rates: 2.6 % of standard deviation, three of them
