@@ -7,7 +7,6 @@ about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that t
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from operator import index
 from typing import Any, TYPE_CHECKING
 
@@ -73,10 +72,6 @@ _COVARIANCES = [_COLUMN[f'c{corner}{term}'] for corner in range(4) for term in (
 _COVARIANCE_TERMS = [_COLUMN[name] for name in CORNER_COVARIANCE_FIELDS]
 _DETECTOR_PX = [_COLUMN['detector_px']]
 _BRANCHES = [_COLUMN[f'{prefix}{name}'] for prefix in ('', 'a') for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')]
-#: Columns of observations, and the places of corners, covariances, detector's error and poses among these.
-_OBSERVED = _CORNERS + _COVARIANCES + _DETECTOR_PX + _BRANCHES
-_ENDS = np.cumsum([len(part) for part in (_CORNERS, _COVARIANCES, _DETECTOR_PX, _BRANCHES)]).tolist()
-_PARTS = [slice(begin, end) for begin, end in pairwise([0, *_ENDS])]
 
 
 def columns(markers: Markers, names: tuple[str, ...]) -> FloatArray:
@@ -182,10 +177,8 @@ class Observations(Stacked):
         """
         if getattr(markers, 'dtype', None) != MARKER_DTYPE:
             raise InputError('markers that are no rows of MARKER_DTYPE, as MarkerDetector.detect returns them')
-        numbers = _numbers(markers, _OBSERVED)
-        corners, covariances, detector_px, poses = (numbers[:, part] for part in _PARTS)
-        corners, covariances = corners.reshape(-1, 4, 2), covariances.reshape(-1, 4, 2, 2)
-        poses = poses.reshape(-1, 2, 7)
+        corners, covariances = corners_px(markers), corner_covariances(markers)
+        detector_px, poses = _numbers(markers, _DETECTOR_PX), _numbers(markers, _BRANCHES).reshape(-1, 2, 7)
         with np.errstate(invalid='ignore', divide='ignore'):
             branches = transform_from_quaternion(poses[..., :3], poses[..., 3:])
         by_readout, rates = np.zeros((len(markers), 4, 2, 6)), np.zeros((len(markers), 4, 2))

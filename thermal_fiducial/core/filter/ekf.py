@@ -115,10 +115,10 @@ class PoseEkf:
             return PoseUpdate(stamp_ns, False, f'refused: {fault}', np.nan)
         if self._T_map_first is not None:
             pose = pose.in_moved_map(inverse(self._T_map_first))
-        pose, step_error_ns = self._in_present_clock(pose)
+        pose = self._in_present_clock(pose)
         if reason := self._unusable(pose):
             return PoseUpdate(stamp_ns, False, reason, np.nan)
-        self._history.insert(pose, step_error_ns)
+        self._history.insert(pose)
         self._history.take_in()
         waiting = PoseUpdate(stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
         return replace(self.decided.get(pose.stamp_ns, waiting), stamp_ns=stamp_ns)
@@ -138,37 +138,36 @@ class PoseEkf:
 
     # --- steps of the clocks --------------------------------------------------------------------------
 
-    def _in_present_clock(self, pose: CameraPose) -> tuple[CameraPose, int]:
-        """``pose`` with all steps of the camera's clock taken out of its stamp, a step that it reveals included.
-
-        Also the standard deviation [ns] of a step that it reveals, 0 without one.
-        """
+    def _in_present_clock(self, pose: CameraPose) -> CameraPose:
+        """``pose`` with all steps of the camera's clock taken out of its stamp, a step that it reveals included."""
         history, clock, pose = self._history, self._camera_clock, self._camera_clock.stamped(pose)
         if not history.imu:
-            return pose, 0
+            return pose
         interval_ns = self._input.longest_short_ns
         step_ns = clock.proposed(pose, history.imu.newest_ns, interval_ns)
         if not clock.suspects_imu:
             # Poses show that samples were lost at the jump: the clock of the IMU has not stepped.
             history.stepped = None
         if not step_ns:
-            return pose, 0
+            return pose
         if abs(step_ns) < SMALLEST_STEP_NS:
             self._allow_for_step(abs(step_ns))
-            return pose, 0
+            return pose
         restamped = replace(pose, stamp_ns=pose.stamp_ns - step_ns)
         if clock.is_step_of_imu(step_ns):
             # Since the step the state was propagated over time that did not pass.
             clock.follow(step_ns)
             self._begin_after_jump()
-            return restamped, 0
+            return restamped
         if not self._contradicts(pose) or not self._fits(restamped):
-            return pose, 0
-        error_ns = clock.uncertainty_ns(interval_ns) if self._config.estimate_time_offset else 0
+            return pose
+        std_ns = clock.uncertainty_ns(interval_ns)
         history.discard(clock.suspects)
         clock.follow(step_ns)
+        if self._config.estimate_time_offset:
+            history.suspect_camera_step(restamped.stamp_ns, std_ns)
         history.take_in()
-        return restamped, error_ns
+        return restamped
 
     def _begin_after_jump(self) -> None:
         """Reset, but keep the estimated clock offset: where stamps jump, mostly samples are missing."""

@@ -100,13 +100,8 @@ class History:
 
     # --- poses, and suspected steps of the clocks -----------------------------------------------------
 
-    def insert(self, pose: CameraPose, camera_step_ns: int = 0) -> None:
-        """Add a pose; :meth:`take_in` applies it once the samples reach its instant.
-
-        ``camera_step_ns``: size of a step of the camera's clock since the last pose, if one is suspected.
-        """
-        if camera_step_ns:
-            self._camera_steps[pose.stamp_ns] = camera_step_ns
+    def insert(self, pose: CameraPose) -> None:
+        """Add a pose; :meth:`take_in` applies it once the samples reach its instant."""
         insort(self._poses, pose, key=_stamp)
         self._undo_from(pose.stamp_ns)
 
@@ -118,12 +113,14 @@ class History:
             self._undo_from(min(stamps))
 
     def suspect_camera_step(self, stamp_ns: int, size_ns: int) -> None:
-        """Allow for a step of the camera's clock by ``size_ns`` before the first kept pose from ``stamp_ns`` on."""
+        """Allow for a step of the camera's clock by ``size_ns`` before the first kept pose from ``stamp_ns`` on.
+
+        Without one, before a pose of that stamp.
+        """
         since = bisect_left(self._poses, stamp_ns, key=_stamp)
-        if since < len(self._poses):
-            first_ns = self._poses[since].stamp_ns
-            self._camera_steps[first_ns] = size_ns
-            self._undo_from(first_ns)
+        first_ns = self._poses[since].stamp_ns if since < len(self._poses) else stamp_ns
+        self._camera_steps[first_ns] = size_ns
+        self._undo_from(first_ns)
 
     def suspect_steps(self, size_ns: int, *, jumped: bool) -> None:
         """Allow for steps ahead of the clocks by ``size_ns`` after the newest sample: or samples are lost there.
