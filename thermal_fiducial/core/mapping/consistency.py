@@ -162,13 +162,14 @@ class Consistency:
             self._misplaced = None
 
     def weigh_map(self, frame: LocatedFrame) -> None:
-        """Note which markers of a frame agree with the map. A frame with two possible poses says nothing of it."""
+        """Note which markers of a frame agree with the map; where two poses are possible, by the likelier one."""
         known, outcome = frame.known, frame.outcome
         if isinstance(outcome, Location):
             errors, error_stds = frame.known_errors
             self.of_map.add(known, errors <= np.minimum(DISAGREEMENT * error_stds, most_px(known)))
-        elif outcome.compared and outcome.pose is None:
-            self.of_map.add(known, np.zeros(len(known.sizes), dtype=np.bool_))
+        elif outcome.compared:
+            sight, reprojection = outcome.compared
+            self.of_map.add(sight, reprojection.errors_px <= most_px(sight))
 
     def judge(
         self,
