@@ -9,12 +9,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import (
-    covariance_of_one_error,
-    decision_weights,
-    SystematicErrors,
-    USUAL_RATE,
-)
+from thermal_fiducial.core.error_model import covariance_of_one_error, decision_weights, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit
 from thermal_fiducial.core.geometry.se3 import difference, inverse, screw_difference, turn_between
@@ -23,31 +18,16 @@ from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, VAGUE
 from thermal_fiducial.core.two_poses import DECISIVE, mean_of_two, unknown_turn
-from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.core.types import FloatArray
 
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.
 _PROPOSERS = 4
 # Standard deviation of a rotation beyond which the linearisation of a fit without odometry means nothing [rad].
 _MEANINGLESS = 1.0
-# Longest time [ns] for which the last pose resolves the planar ambiguity of the next.
-_CONTINUITY_NS = 300_000_000
-
-
-def last_at(stamp_ns: int, last: CameraPose | None) -> CameraPose | None:
-    """The ``last`` pose for a frame that follows soon, uncertain by what a robot may have turned since."""
-    if last is None or not 0 < stamp_ns - last.stamp_ns < _CONTINUITY_NS:
-        return None
-    turn = USUAL_RATE * (stamp_ns - last.stamp_ns) / SECOND_NS
-    return last.widened(np.diag([0.0, 0.0, 0.0, turn, turn, turn]) ** 2)
 
 
 def locate(
-    stamp_ns: int,
-    sight: Sight,
-    camera: Camera,
-    errors: SystematicErrors,
-    odometry: CameraPose | None = None,
-    last: CameraPose | None = None,
+    stamp_ns: int, sight: Sight, camera: Camera, errors: SystematicErrors, odometry: CameraPose | None = None
 ) -> Location | Refusal:
     """Camera pose from N known markers.
 
@@ -55,14 +35,13 @@ def locate(
     ----------
     sight : the markers and their corners
     odometry : the camera by odometry
-    last : without odometry, the camera by the frame before, which resolves the planar ambiguity
 
     Returns
     -------
     The location, or the reason for which there is none.
     """
     fit = CameraFit(sight.observed.corners, sight.observed.covariances, sight.points, camera)
-    hypotheses = _hypotheses(sight, odometry or last)
+    hypotheses = _hypotheses(sight, odometry)
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
     hypotheses = hypotheses[np.argsort(fit.costs(hypotheses), kind='stable')]
@@ -76,7 +55,7 @@ def locate(
     if not shown.all():
         # A marker that the camera could not show is not where the map has it. The others give the pose, if most are.
         if 2 * np.count_nonzero(shown) > len(shown):
-            return locate(stamp_ns, sight.only(shown), camera, errors, odometry, last)
+            return locate(stamp_ns, sight.only(shown), camera, errors, odometry)
         return Refusal(f'no camera pose explains {sight.names}', compared=(sight, reprojection))
     # Steps 5 and 6: refined with the weights of their errors.
     found = frame.refined(T, reprojection, frame.weights(reprojection, by_map))
@@ -87,7 +66,7 @@ def locate(
         return found if other is None and found.rotation_std <= VAGUE else _by_odometry(frame, found, other, odometry)
     if other is None:
         return found
-    return _either(frame, found, other, last) if other.is_minimum else _widened(found, other)
+    return _either(frame, found, other) if other.is_minimum else _widened(found, other)
 
 
 def _by_odometry(frame: JointFit, found: Location, other: Alternative | None, odometry: CameraPose) -> Location:
@@ -124,21 +103,17 @@ def _widened(found: Location, other: Alternative) -> Location:
     return found.unsettled(covariance_of_one_error(apart, math.sqrt(share)))
 
 
-def _either(frame: JointFit, found: Location, other: Alternative, last: CameraPose | None) -> Location | Refusal:
-    """The one of two poses that the corners allow which the last frame shows to be right.
+def _either(frame: JointFit, found: Location, other: Alternative) -> Location | Refusal:
+    """The mean of two poses that the corners allow, unless the other one hardly fits.
 
-    Where none does, the map learns nothing from the frame, and the pose is the mean of both: the filter, which has
-    gravity and follows both over time, finds the two in it.
+    The map learns nothing from the frame. The filter, which has gravity and follows both over time, finds the two in
+    the mean.
     """
     T = other.T_map_camera
     second = frame.refined(T, frame.sight.reprojected(frame.camera, T), found.weights, found.noise_factor)
     # One that hardly fits at all ends anywhere.
     if second is None or second.rotation_std > _MEANINGLESS:
         return found
-    if last is not None:
-        excess = other.excess + _cost_of_turn(second.pose, last) - _cost_of_turn(found.pose, last)
-        if abs(excess) > DECISIVE:
-            return found if excess > 0.0 else second
     chi2 = frame.fit.costs(np.stack([found.pose.T_map_camera, second.pose.T_map_camera]))
     chi2 *= decision_weights(frame.sight.noise_px, frame.sight.observed.readout_px).min()
     both = Viewpoint.either(found.viewpoint, second.viewpoint, chi2)
@@ -159,13 +134,6 @@ def _mean(likelier: Location, less_likely: Location) -> CameraPose:
     first, other = (pose.covariance - pose.map_covariance for pose in (likelier.pose, less_likely.pose))
     at_own = replace(mean, covariance=0.5 * (first + other) + mean.map_covariance)
     return mean_of_two(at_own, screw_difference(T_other, mean.T_map_camera))
-
-
-def _cost_of_turn(pose: CameraPose, last: CameraPose) -> float:
-    """Minus twice the logarithm of the likelihood of a camera's attitude by an independent one."""
-    turn = difference(pose.T_map_camera, last.T_map_camera)[3:]
-    covariance = pose.covariance[3:, 3:] + last.covariance[3:, 3:]
-    return float(turn @ np.linalg.solve(covariance, turn) + np.linalg.slogdet(covariance)[1])
 
 
 def _hypotheses(sight: Sight, prior: CameraPose | None) -> FloatArray:

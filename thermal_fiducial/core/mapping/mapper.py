@@ -24,12 +24,12 @@ from thermal_fiducial.core.mapping.candidates import Candidate, NewMarkers
 from thermal_fiducial.core.mapping.consistency import Consistency, from_consistent_markers
 from thermal_fiducial.core.mapping.corner_bias import CornerBias
 from thermal_fiducial.core.mapping.keyframes import KeyframeStore, VIEWS
-from thermal_fiducial.core.mapping.localization import last_at, locate
+from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import jump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.undeclared_readout import UndeclaredReadout
-from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
+from thermal_fiducial.core.measurements import Markers, Observations
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
@@ -92,8 +92,6 @@ class MarkerMapper:
         self._initial, self.map = marker_map.copy(), marker_map.with_assumed_draws(self.errors)
         self._new = NewMarkers(self.config.marker_size, size_overrides(self.config.marker_size_overrides))
         self._consistency = Consistency(self.map.markers)
-        #: the last pose that nothing contradicted
-        self._last: CameraPose | None = None
         self._keyframes = KeyframeStore(self.config.keyframe_budget, self.map)
         #: frames with two possible poses that candidates have views of, by stamp
         self._doubtful: dict[int, LocatedFrame] = {}
@@ -103,9 +101,6 @@ class MarkerMapper:
 
         Which markers agree with odometry, and which one is misplaced, both learn together: one robot carries them.
         """
-        if owner._initial is not self._initial:
-            # Poses in a map that was replaced say nothing of this one.
-            self._initial, self._last = owner._initial, None
         self.map, self._consistency = owner.map, owner._consistency
         self.frozen, self._owns_map = True, False
 
@@ -137,8 +132,8 @@ class MarkerMapper:
         sight = known if known.trusted.all() else known.only(known.trusted)
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.sizes):
-            odometry, last = (None, last_at(stamp_ns, self._last)) if predicted is None else (predicted.pose, None)
-            fit = partial(locate, stamp_ns, camera=camera, errors=errors, odometry=odometry, last=last)
+            odometry = None if predicted is None else predicted.pose
+            fit = partial(locate, stamp_ns, camera=camera, errors=errors, odometry=odometry)
             outcome = from_consistent_markers(sight, camera, predicted, fit)
         elif len(known.sizes):
             outcome = Refusal('all known markers in view are in quarantine')
@@ -182,9 +177,6 @@ class MarkerMapper:
             # Probably a moved or duplicated marker: an update would corrupt the map.
             waiting = dict.fromkeys(frame.new.ids.tolist(), CONTRADICTED)
         else:
-            # A pose that is too uncertain to be published, or not the only possible one, settles no ambiguity.
-            if outcome.settled:
-                self._last = frame.pose or self._last
             updated = True
             # Step 7: errors updated.
             self._bias.add(outcome)

@@ -121,30 +121,6 @@ def test_an_unsettled_ambiguity_claims_both_poses():
     assert np.mean(unsettled) / 6.0 < 1.5
 
 
-def test_continuity_settles_an_ambiguity():
-    poses = {0: wall(np.random.default_rng(0), tilt=0.0)[0]}
-    rng = np.random.default_rng(5)
-    centre = poses[0][:3, 3]
-    m = mapper(known(poses))
-    for k in range(200):
-        # From near, where one pose is clear, to far, where two are possible.
-        T = look(centre + (1.0 + 0.03 * k) * np.array([-np.cos(0.4), np.sin(0.4), 0.0]), centre)
-        result = m.process(stamp(k), see(T, poses, 0.1, rng), CAMERA)
-        assert result.pose is not None, result.reason
-        assert np.linalg.norm(difference(result.pose.T_map_camera, T)[3:]) < np.deg2rad(20.0)
-
-
-def test_a_pose_that_is_not_the_only_possible_one_settles_no_other():
-    """Corners of 0.7 px, 11 degrees from the front: the poses of the first frame merge, those of the second do not."""
-    poses = {0: wall(np.random.default_rng(0), tilt=0.0)[0]}
-    centre, rng = poses[0][:3, 3], np.random.default_rng(35)
-    T, m = look(centre + 2.2 * np.array([-np.cos(0.2), np.sin(0.2), 0.0]), centre), mapper(known(poses))
-    first, second = (m.process(stamp(k), see(T, poses, 0.7, rng), CAMERA) for k in range(2))
-    assert first.pose is not None
-    assert not first.reason
-    assert second.reason == 'planar ambiguity of marker 0 unsettled'
-
-
 def test_a_marker_seen_twice_in_a_frame_is_left_out():
     rng = np.random.default_rng(6)
     poses = wall(rng)
