@@ -74,10 +74,7 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
     problem = MapProblem.build(snapshot)
     if problem is None:
         return None
-    now = problem.evaluate(problem.start)
-    if problem.J_common[..., 0].any():
-        problem = _with_weight_of_aspect(problem, snapshot, now)
-    now = _minimise(problem, now)
+    now = _minimise(problem, problem.evaluate(problem.start))
     mirrored = _with_mirrored(problem, now)
     now = now if mirrored is None else _minimise(problem, mirrored)
     return _result(problem, snapshot, now)
@@ -101,25 +98,6 @@ def _error_sources(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> 
     if system is None:
         return None
     return ErrorSources(problem, system, now, weights, snapshot.errors, factor, np.random.default_rng(0))
-
-
-def _with_weight_of_aspect(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> MapProblem:
-    """The problem with a prior of the aspect ratio so strong that the estimate comes nearest to the true error.
-
-    The smooth error of the lens and the markers' shapes look like an error of the aspect ratio, too. So its
-    information is not that of the declared error, 1, but follows from all of them. It stays 1 where the equations are
-    singular.
-    """
-    sources = _error_sources(problem, snapshot, now)
-    if sources is None:
-        return problem
-    prior = float(problem.common_information[0])
-    shown = 1.0 / sources.system.covariance[0, 0] - prior
-    gain = shown / (shown + prior)
-    best = min(gain**2 / max(sources.variance_of_aspect(), TINY), 1.0 - TINY)
-    if best <= TINY:
-        return problem
-    return replace(problem, common_information=np.append(shown * (1.0 / best - 1.0), problem.common_information[1:]))
 
 
 def _minimise(problem: MapProblem, now: Linearised) -> Linearised:

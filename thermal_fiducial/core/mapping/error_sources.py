@@ -72,17 +72,6 @@ class ErrorSources:
         aspect = LensErrors(problem.corners[:1], problem.camera, self.errors).aspect_draws
         return MapErrors(covariances, draws[:-1], aspect - found[0], float(np.sqrt(np.mean(found[1] ** 2))))
 
-    def variance_of_aspect(self) -> float:
-        """Variance of the estimate of the aspect ratio's error, by noise and systematic errors, this one included."""
-        problem, now, moved, covariance = self.problem, self.now, self.system.moved, self.system.covariance
-        of_cameras = np.swapaxes(now.to_camera, -1, -2) @ moved.frames[problem.frame]
-        by_common = problem.J_common - now.J @ (moved.nodes[problem.marker] + of_cameras)
-        gains = self._by_corners(by_common @ (covariance[:, :1] / covariance[0, 0]))
-        of_shapes = np.sum(problem.over_markers(gains) ** 2, axis=(1, 2, 3)) @ self._shapes() ** 2
-        of_lens = LensErrors(problem.corners, problem.camera, self.errors).covariance(gains.reshape(-1, 1, 2)).item()
-        noise = self.variance_factor * self.noise_of_common[0, 0]
-        return float(covariance[0, 0] ** 2 * (of_shapes + of_lens) + noise)
-
     @property
     def noise_of_common(self) -> FloatArray:
         """Covariance (2, 2) by noise and the prior of the readout time; the aspect ratio's error is a lasting one."""

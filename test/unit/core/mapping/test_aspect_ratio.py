@@ -8,9 +8,6 @@ from support.walls import CAMERA, flight, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import DRAWS
-from thermal_fiducial.core.lens_errors import LensErrors
-from thermal_fiducial.core.mapping.adjustment_problem import MapProblem
-from thermal_fiducial.core.mapping.error_sources import ErrorSources
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import corners_px
@@ -52,23 +49,6 @@ def test_the_error_of_the_aspect_ratio_is_found_within_its_claim():
     off_px = corrected_by(m, poses)
     # What is left of corners that are off by 0.15 % of their distance from the principal point.
     assert off_px < 3.0 * left * WRONG * CAMERA.width / 2.0
-
-
-def test_the_variance_of_what_is_estimated_is_that_of_its_draws():
-    m, _ = mapped(5.0, 0.05)
-    problem = MapProblem.build(m.snapshot())
-    now = problem.evaluate(problem.start)
-    weights = now.weights(1.0)
-    system = problem.equations.reduced(problem.normal(now, 1.0)[0])
-    estimated = []
-    for seed in range(30):
-        sources = ErrorSources(problem, system, now, weights, m.errors, 1.0, np.random.default_rng(seed))
-        errors = sources.of_markers(np.zeros((len(problem.ids), 6, DRAWS)))
-        lens = LensErrors(problem.corners[:1], CALIBRATED, m.errors)
-        estimated.append(lens.aspect_draws - errors.aspect_left)
-    # The lens has the same draws each time, and these have just its covariance; 1920 draws of noise and shapes are
-    # accurate to 3 %: three standard deviations.
-    assert np.isclose(np.mean(np.square(estimated)), sources.variance_of_aspect(), rtol=0.1)
 
 
 @pytest.mark.parametrize('share', [0.0, 0.02])
