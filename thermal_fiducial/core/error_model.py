@@ -45,9 +45,8 @@ class SystematicErrors:
     #: once. Prior of its estimate, by frames and in an adjustment of the map, whose covariances have what that leaves;
     #: enters corners by that (``UndeclaredReadout``), and with these poses and new markers.
     readout_time_std: float = 0.015
-    #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges. To
-    #: begin with, and at most, as measured on rendered flights with three lenses and 0.5 to 9 K; learned in flight from
-    #: residuals that last (``CornerBias``). Enters the covariance of a joint adjustment.
+    #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges. At
+    #: most this on rendered flights with three lenses and 0.5 to 9 K. Enters the covariance of a joint adjustment.
     marker_shape: float = 0.7
     #: The most likely size of what ``corner_px`` is the root mean square of [px]: residuals of a marker are compared
     #: with it. Enters weights of markers.
@@ -84,8 +83,7 @@ WHITE_PX = 0.5
 #: Covariance of an unknown acceleration of robot and camera in a brisk flight: 3 m/s^2, 4 rad/s^2.
 UNKNOWN_ACCELERATION = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2
 #: Standard deviations of a robot's velocity [m/s] and turn rate [rad/s], each along any axis, where nothing measures
-#: them: medians over rendered missions are 0.3 and 0.5. Enter poses without odometry, by rows that are read late and by
-#: the turn since the last frame.
+#: them: medians over rendered missions are 0.3 and 0.5. Enter poses without odometry, by rows that are read late.
 USUAL_SPEED, USUAL_RATE = 0.5, 0.5
 #: Joint draws of the errors of a map: standard deviations by 64 are accurate to a tenth, those by the lens exact.
 DRAWS = 64

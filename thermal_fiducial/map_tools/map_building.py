@@ -95,7 +95,7 @@ def build_map(
 
 
 def _stamp(k: int) -> int:
-    """Stamp of frame k, the same in every pass; frames are seconds apart, since unordered ones have no continuity."""
+    """Stamp of frame k, the same in every pass."""
     return (k + 1) * SECOND_NS
 
 

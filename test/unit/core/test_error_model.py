@@ -355,13 +355,3 @@ def test_errors_that_each_corner_has_for_itself_are_no_bias_where_the_detector_k
     assert found[0.0] > found[0.015] > found[0.03]
     # Eight markers distinguish the two to a fifth of the errors.
     assert found[0.06] ** 2 - nothing**2 < (0.2 * 0.06) ** 2
-
-
-@pytest.mark.parametrize('share', [0.1, 0.5])
-def test_the_shape_of_markers_is_learned_from_what_lasts_of_their_residuals(share):
-    shapes = 0.03 * share * np.random.default_rng(7).normal(size=(8, 4, 2))
-    found = learned(60, lambda _, rows: shapes[rows['id']]).shape
-    # The prior of 0.7 counts as 5 frames of 64. Noise makes the mean of 59 products of 48 degrees of freedom uncertain
-    # by 0.02 / 0.75, and the shapes that were drawn are good to a fifth: 2.5 sigma of both.
-    expected = (5 * 0.7**2 + 59 * share**2) / 64
-    assert abs(found**2 - expected) < 2.5 * np.hypot(0.025, 0.2 * share**2)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import CHI2_OF_VIEW, INCONSISTENT_PX, SystematicErrors
+from thermal_fiducial.core.error_model import INCONSISTENT_PX
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.types import FloatArray, Stacked, TINY
 
@@ -15,17 +15,10 @@ from thermal_fiducial.core.types import FloatArray, Stacked, TINY
 #: and its degrees of freedom. Its mode is 0.1 px, which good calibrations leave, its mean 0.3 px: published lenses of
 #: seven recordings are off by 0.1 to 1.0 px. These alone are likeliest by 0.07 px^2 and 1.1, which have no mean.
 BIAS_SQUARES, BIAS_FREEDOM = 0.05, 2.5
-#: Weight of the prior of the markers' shapes in frames.
-SHAPE_PRIOR = 5.0
-#: Forgetting factor of both per frame, a memory of 300 frames.
+#: Forgetting factor per frame, a memory of 300 frames.
 BIAS_MEMORY = 1.0 - 1.0 / 300.0
 #: Residuals of a marker beyond this many times the most likely bias count as so many; in a fit, of bias and noise.
 BIAS_OUTLIER = 2.0
-#: Variance of a marker's shape, in units of the noise, beyond which it counts as so much: 99.9 % of markers with noise
-#: alone are below.
-LARGEST_SHAPE = CHI2_OF_VIEW / 8.0
-#: Part of the variance of independent corners that is left without their mean.
-SHAPE_VISIBLE = 0.75
 #: Most fits of a pose by corners alone, each with less weight for markers that the last one shows as mistaken.
 _REFITS = 4
 #: Fewest markers for the corner bias: the pose absorbs nearly all of the error of fewer.
@@ -39,20 +32,16 @@ class CornerBias:
     variance of the systematic error, less the part that the pose absorbs: most of an error that is smooth over the
     image, hardly any of errors that each corner has for itself. These the detector claims in the corners' noise
     already; the rest is the bias. Where the image has moved since the last frame, the two have less of the smooth error
-    in common, and the pair counts for less. Without the mean over each marker's corners the product is that of the
-    markers' shapes. Errors of partially visible markers are correlated for other reasons; in the bias markers are
-    weighted by their claimed noise.
+    in common, and the pair counts for less. Errors of partially visible markers are correlated for other reasons:
+    markers are weighted by their claimed noise.
     """
 
     def __init__(self) -> None:
         #: standard deviation of the bias [px] by the mean of its variance, which is claimed, and by the mode, which is
         #: what residuals are compared with
         self.px, self.likely_px = _by_mean_and_mode(BIAS_SQUARES, BIAS_FREEDOM)
-        #: standard deviation of the shapes as a share of the corners' noise
-        self.shape = SystematicErrors().marker_shape
-        # Sums over frames: their number, the weights of their markers, shapes, what is known of corners' own errors,
-        # and what residuals show.
-        self._sums = np.zeros(9)
+        # Sums over frames: the weights of their markers, what is known of corners' own errors, and what residuals show.
+        self._sums = np.zeros(7)
         #: the last frame, and its corners
         self._last: tuple[Location, _FittedCorners] | None = None
 
@@ -79,25 +68,16 @@ class CornerBias:
             return
         fitted, former_fitted = self._last[1].only(now), before[1].only(then)
         residuals, former = fitted.residuals, former_fitted.residuals
-        products = _mean_products(residuals, former)
-        of_shape = products - (residuals.mean(axis=1) * former.mean(axis=1)).sum(axis=1) / 2.0
-        corners, former_corners = fitted.corners, former_fitted.corners
-        of_shape = np.clip(of_shape / (corners.noise_px * former_corners.noise_px), -LARGEST_SHAPE, LARGEST_SHAPE)
-        shares = corners.shares * former_corners.shares
+        shares = fitted.corners.shares * former_fitted.corners.shares
         # Residuals of moved or mistaken markers are correlated too.
-        bounds = _bounds(products, min(INCONSISTENT_PX, BIAS_OUTLIER * self.likely_px))
+        bounds = _bounds(_mean_products(residuals, former), min(INCONSISTENT_PX, BIAS_OUTLIER * self.likely_px))
         shown, common = shown_errors(fitted, former_fitted, bounds)
         known = shown.own * float(shares @ location.sight.observed.detector_px[now] ** 2) / len(now)
         common *= self._weight(fitted, shown)
-        sums = common * np.array((shares.mean(), known, *shown))
-        self._sums = BIAS_MEMORY * self._sums + (1.0, of_shape.mean() / SHAPE_VISIBLE, *sums)
-        frames, shapes, weight, known, *sums_shown = self._sums.tolist()
+        self._sums = BIAS_MEMORY * self._sums + common * np.array((shares.mean(), known, *shown))
+        weight, known, *sums_shown = self._sums.tolist()
         variance = max(ShownErrors(*sums_shown).smooth_variance(known), 0.0)
         self.px, self.likely_px = _by_mean_and_mode(BIAS_SQUARES + weight * variance, BIAS_FREEDOM + weight)
-        # Not all that lasts until the next frame is alike in all views: the shape is never more than at first.
-        prior = SystematicErrors().marker_shape
-        squares = SHAPE_PRIOR * prior**2 + max(shapes, 0.0)
-        self.shape = min(math.sqrt(squares / (SHAPE_PRIOR + frames)), prior)
 
 
 def _mean_products(residuals: FloatArray, former: FloatArray) -> FloatArray:

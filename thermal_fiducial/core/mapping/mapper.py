@@ -156,7 +156,6 @@ class MarkerMapper:
             marker_size_std=config.marker_size_std,
             focal_length_std=config.focal_length_std,
             readout_time_std=config.readout_time_std,
-            marker_shape=self._bias.shape,
             likely_corner_px=self._bias.likely_px,
         )
 
