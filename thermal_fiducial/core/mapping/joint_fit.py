@@ -153,13 +153,6 @@ class JointFit:
         _, chi2 = self._weighted(found.reprojection, relative)
         return np.asarray(relative / noise_factor(chi2, 8 * len(relative) - 6))
 
-    def relative_to_markers(self, odometry: CameraPose) -> CameraPose:
-        """``odometry`` with the error of the marker whose place in the map is known best."""
-        covariances = self.sight.map_covariances
-        best = int(np.argmin(np.trace(covariances, axis1=1, axis2=2)))
-        to_camera = lever_arm(odometry.T_map_camera[:3, 3] - self.sight.T_map_marker[best, :3, 3])
-        return odometry.widened(to_camera @ covariances[best] @ to_camera.T)
-
     def likeliest(self, start: FloatArray, prior: CameraPose, weights: FloatArray) -> tuple[float, FloatArray] | None:
         """The likeliest camera (4, 4) by corners and ``prior``, from a ``start`` (4, 4), and its cost, chi square.
 

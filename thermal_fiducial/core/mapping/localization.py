@@ -77,9 +77,9 @@ def _by_odometry(frame: JointFit, found: Location, other: Alternative | None, od
     of many frames would confirm an error of the odometry (the iterated Kalman filter linearises at the likeliest pose:
     B. Bell, F. Cathey, IEEE TAC 1993).
     """
-    weights, prior = frame.decisive_weights(found), frame.relative_to_markers(odometry)
+    weights = frame.decisive_weights(found)
     starts = [found.pose.T_map_camera] + ([] if other is None else [other.T_map_camera])
-    ends = sorted(filter(None, (frame.likeliest(T, prior, weights) for T in starts)), key=lambda end: end[0])
+    ends = sorted(filter(None, (frame.likeliest(T, odometry, weights) for T in starts)), key=lambda end: end[0])
     location = frame.measured(ends[0][1], weights) if ends else None
     if location is None:
         return found
