@@ -201,7 +201,7 @@ class MapProblem:
         corners, W = snapshot.corners[views], whitening(snapshot.covariances[views])
         readout_std = snapshot.errors.readout_time_std
         by_aspect = of_aspect(corners, camera, snapshot.errors)
-        # One that is smaller than the smooth error of the lens cannot be told from it.
+        # One that is smaller than the smooth error of the lens looks like it.
         by_aspect *= np.abs(by_aspect).max() > snapshot.errors.corner_px
         by_common = by_aspect, readout_std * snapshot.rates[views]
         common = np.array([0.0, snapshot.readout / readout_std if readout_std else 0.0])
