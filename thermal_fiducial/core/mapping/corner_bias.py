@@ -19,8 +19,6 @@ BIAS_SQUARES, BIAS_FREEDOM = 0.05, 2.5
 BIAS_MEMORY = 1.0 - 1.0 / 300.0
 #: Residuals of a marker beyond this many times the most likely bias count as so many; in a fit, of bias and noise.
 BIAS_OUTLIER = 2.0
-#: Most fits of a pose by corners alone, each with less weight for markers that the last one shows as mistaken.
-_REFITS = 4
 #: Fewest markers for the corner bias: the pose absorbs nearly all of the error of fewer.
 FEWEST_MARKERS = 3
 
@@ -152,13 +150,10 @@ class _WeightedCorners(Stacked):
     def of(location: Location, bias_px: float) -> '_WeightedCorners':
         """All markers of a frame; ``bias_px`` is the standard deviation of the bias, as known by then."""
         noise, fit = location.sight.noise_px, location.reprojection
-        by_noise, residuals = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2), fit.residuals
-        for _ in range(_REFITS):
-            bounds = _bounds(_mean_products(residuals, residuals), BIAS_OUTLIER * np.hypot(noise, bias_px))
-            shares = by_noise * bounds
-            if bounds.min() == 1.0:
-                break
-            residuals = _refitted(fit.residuals, fit.J_camera, shares)
+        by_noise = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2)
+        residuals = _refitted(fit.residuals, fit.J_camera, by_noise)
+        bounds = _bounds(_mean_products(residuals, residuals), BIAS_OUTLIER * np.hypot(noise, bias_px))
+        shares = by_noise * bounds
         weights = shares[:, None, None]
         map_draws = weights * (fit.J_marker @ location.sight.draws)
         return _WeightedCorners(shares, noise, fit.residuals, fit.J_camera, weights * location.lens.modes, map_draws)
