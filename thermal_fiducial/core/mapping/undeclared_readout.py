@@ -44,11 +44,6 @@ class ReadoutEstimate:
     seconds: float
     std: float
 
-    @property
-    def sigmas(self) -> float:
-        """By how many standard deviations it contradicts the declaration."""
-        return abs(self.seconds) / math.hypot(self.std, READOUT_AS_DECLARED)
-
 
 @dataclass(frozen=True)
 class ImageMotion:
@@ -174,10 +169,10 @@ class UndeclaredReadout:
     @property
     def doubt(self) -> str:
         """Warning for diagnostics and console, with what to write; empty while nothing contradicts the declaration."""
-        seconds = self.estimate.seconds
-        if self.estimate.sigmas < _CONTRADICTS:
+        seconds, std = self.estimate.seconds, self.estimate.std
+        if abs(seconds) < _CONTRADICTS * math.hypot(std, READOUT_AS_DECLARED):
             return ''
-        off, std = 1e3 * abs(seconds), 1e3 * self.estimate.std
+        off, std = 1e3 * abs(seconds), 1e3 * std
         more, add = ('more', 'add') if seconds > 0.0 else ('less', 'subtract')
         return f'rows are read over {off:.1f} +- {std:.1f} ms {more} than readout_time says: {add} {1e-3 * off:.4f}'
 
