@@ -38,7 +38,7 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 _IDENTITY = np.eye(9)
 #: Longest time of coasting that is looked ahead [s], and its resolution [s]. A time of hover is divided into so many
-#: steps: the exponential is exact for any, the deviation by white noise and walks to 2 per cent.
+#: steps: the exponential is exact for any, the deviation by white noise and walks to 3 per mille.
 HORIZON, _TICK, _STEPS = 60.0, 0.05, 10
 
 
@@ -160,4 +160,8 @@ def hovered(estimate: Estimate, densities: FloatArray, walks: FloatArray, second
     hover = np.concatenate((np.zeros(3), -state.gravity @ state.R_map_body))
     exact = replace(state, bias=np.zeros(6), scale=np.zeros((2, 3, 3)), velocity=np.zeros(3))
     steps = Steps(np.tile(hover, (_STEPS, 1)), np.full(_STEPS, seconds / _STEPS), np.tile(densities, (_STEPS, 1)))
-    return propagated(replace(estimate, state=exact), steps, estimate.stamp_ns + round(seconds * SECOND_NS), walks)
+    # What walks in a step counts from its middle on, not from its end.
+    half = np.diag(walks * (0.5 * seconds / _STEPS))
+    begun = replace(estimate, state=exact, covariance=estimate.covariance + half)
+    ended = propagated(begun, steps, estimate.stamp_ns + round(seconds * SECOND_NS), walks)
+    return replace(ended, covariance=ended.covariance - half)
