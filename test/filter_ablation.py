@@ -104,9 +104,10 @@ MECHANISMS = {
     ),
     'motion at a pose from 0.1 s': Mechanism(('slow and noisy',), off={'imu_buffer:_MOTION_SECONDS': 0.0}),
     'steps of the clock of the camera': Mechanism(
-        ('stepping clock', 'small step of clock'),
-        ('camera_clock:CameraClock',),
-        {'camera_clock:CameraClock.proposed': _first(0)},
+        ('stepping clock',), ('camera_clock:CameraClock',), {'camera_clock:CameraClock.proposed': _first(0)}
+    ),
+    'stamps off the grid of frames': Mechanism(
+        ('small step of clock',), ('camera_clock:FrameGrid',), {'camera_clock:FrameGrid.off_grid': lambda *_: 0}
     ),
     'start about the learned clock offset': Mechanism(
         ('shaken start',),

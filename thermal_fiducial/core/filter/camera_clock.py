@@ -1,6 +1,7 @@
 """Steps of the camera's clock.
 
-The delay of poses changes by the whole step, but a pipeline that stalls changes it too: a step is proposed once several
+A step shows in two ways. A stamp is off the grid of frames, at once, but not after a step by whole frames. And the
+delay of poses changes by the whole step, but a pipeline that stalls changes it too: a step is proposed once several
 poses agree on it.
 
 Small ones are left to the offset in the state; its variance grows before the first pose after the step. Of those that
@@ -18,13 +19,17 @@ from thermal_fiducial.core.measurements import CameraPose
 #: Smallest step [ns] that is removed. Smaller ones are left to the estimated clock offset, as motion is nearly straight
 #: over that time.
 SMALLEST_STEP_NS = 35_000_000
-#: Smallest change of the delay [ns] that may be a step: the offset, whose walk allows for less, follows smaller ones.
-_CHANGED_NS = 7_500_000
+#: Smallest change of the delay [ns] that may be a step: three quarters of a frame at 60 Hz. Smaller steps are off the
+#: grid of frames.
+_CHANGED_NS = 12_500_000
 #: Poses in a row that must agree on a step; poses kept for the usual delay, and the fewest for it to be known.
 _POSES, _USUAL, _ENOUGH = 5, 30, 15
 #: Largest range [ns] of the delays of agreeing poses where usual ones scatter by less, beside half of the step; a tenth
 #: of the usual ones.
 _AGREEMENT_NS, _END = 50_000_000, _USUAL // 10
+#: A stamp is off the grid of frames beyond this multiple of the largest recent distance, which is jitter, and this
+#: length [ns]. After this time [ns] the grid is lost, as errors of the period add up.
+_OFF_GRID, _OFF_GRID_NS, _LOST_NS = 3, 1_000_000, 1_000_000_000
 #: Poses with an unusual delay after a jump of the IMU's stamps that are held back until a cause is found.
 _PATIENCE = 15
 
@@ -133,3 +138,31 @@ class CameraClock:
         self.ahead_ns += step_ns
         self._latest.clear()
         self._imu_jump_ns = 0
+
+
+class FrameGrid:
+    """The grid of the camera's stamps: whole periods apart, as poses of some frames may be missing."""
+
+    def __init__(self) -> None:
+        self._last_ns = 0
+        #: latest steps between stamps, and their distances from a whole number of periods [ns]
+        self._steps: deque[int] = deque(maxlen=_USUAL)
+        self._distances: deque[int] = deque(maxlen=_USUAL)
+
+    def off_grid(self, stamp_ns: int) -> int:
+        """Distance [ns] of a stamp from the grid of the last ones; 0 unless it is far larger than all recent ones."""
+        step_ns, known = stamp_ns - self._last_ns, sorted(self._steps)
+        if -_LOST_NS < step_ns <= 0:
+            return 0
+        self._last_ns = stamp_ns
+        if not 0 < step_ns < _LOST_NS:
+            return 0
+        self._steps.append(step_ns)
+        if len(known) < _ENOUGH:
+            return 0
+        # The shortest step may be that of a clock that went back.
+        period_ns = known[1]
+        distance_ns = abs(step_ns - max(round(step_ns / period_ns), 1) * period_ns)
+        usual_ns = max(self._distances) if len(self._distances) >= _ENOUGH else distance_ns
+        self._distances.append(distance_ns)
+        return distance_ns if distance_ns > _OFF_GRID * usual_ns + _OFF_GRID_NS else 0

@@ -7,7 +7,7 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Hypothesis, PoseUpdate
-from thermal_fiducial.core.filter.camera_clock import CameraClock, SMALLEST_STEP_NS
+from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid, SMALLEST_STEP_NS
 from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.hypotheses import KNOWN_OFFSET_STD, passes_with_unknown_clock
 from thermal_fiducial.core.filter.imu_input import CLOCK_EVIDENCE, ImuInput, Verdict
@@ -45,7 +45,7 @@ class PoseEkf:
         config, self._restart_reason = self._config, reason
         self._imu_refused = self._refused_in_row = 0
         self._input = ImuInput(config.max_imu_gap, config.imu.gyroscope_range, config.imu.accelerometer_range)
-        self._camera_clock = CameraClock()
+        self._camera_clock, self._frame_grid = CameraClock(), FrameGrid()
         self._begin(config.camera_time_offset)
 
     def _begin(self, camera_time_offset: float) -> None:
@@ -113,11 +113,14 @@ class PoseEkf:
         stamp_ns = pose.stamp_ns
         if fault := _fault_of(pose):
             return PoseUpdate(stamp_ns, False, f'refused: {fault}', np.nan)
+        off_grid_ns = self._frame_grid.off_grid(stamp_ns) if self._config.estimate_time_offset else 0
         if self._T_map_first is not None:
             pose = pose.in_moved_map(inverse(self._T_map_first))
         pose = self._in_present_clock(pose)
         if reason := self._unusable(pose):
             return PoseUpdate(stamp_ns, False, reason, np.nan)
+        if off_grid_ns:
+            self._history.suspect_camera_step(pose.stamp_ns, off_grid_ns)
         self._history.insert(pose)
         self._history.take_in()
         waiting = PoseUpdate(stamp_ns, False, 'waits for the IMU', np.nan, pending=True)

@@ -119,7 +119,7 @@ class History:
         """
         since = bisect_left(self._poses, stamp_ns, key=_stamp)
         first_ns = self._poses[since].stamp_ns if since < len(self._poses) else stamp_ns
-        self._camera_steps[first_ns] = size_ns
+        self._camera_steps[first_ns] = max(size_ns, self._camera_steps.get(first_ns, 0))
         self._undo_from(first_ns)
 
     def suspect_steps(self, size_ns: int, *, jumped: bool) -> None:
