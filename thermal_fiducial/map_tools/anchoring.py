@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from operator import itemgetter
 
 import numpy as np
 
@@ -73,22 +72,19 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> Anchore
         )
     doubts = _doubts_of_axes(T, _is_clearly_closer(distances, mirrored, radius))
     anchored = transformed(marker_map, T)
-    stds = {
-        key: _std_of_alignment(target, distances, marker.T_map_marker[:3, 3])
-        for key, marker in anchored.markers.items()
-    }
-    least_known = max(stds.items(), key=itemgetter(1))
+    ids, places = list(anchored.markers), [marker.T_map_marker[:3, 3] for marker in anchored.markers.values()]
+    stds = _stds_of_alignment(target, distances, np.stack(places))
+    least_known = ids[int(np.argmax(stds))], float(stds.max())
     return AnchoredMap(anchored, dict(zip(common, distances.tolist(), strict=True)), least_known, tuple(doubts))
 
 
-def _std_of_alignment(target: FloatArray, distances: FloatArray, place: FloatArray) -> float:
-    """Standard deviation [m] of a ``place`` (3,) by an alignment to ``target`` (N, 3), ``distances`` (N,) away."""
+def _stds_of_alignment(target: FloatArray, distances: FloatArray, places: FloatArray) -> FloatArray:
+    """Standard deviations (M,) [m] of ``places`` (M, 3) by an alignment to ``target`` (N, 3), off by ``distances``."""
     centre = target.mean(axis=0)
     variance = distances @ distances / (3 * len(target) - 6)
-    by_alignment = lever_arm(target - centre)[:, :3]
-    information = (by_alignment.swapaxes(1, 2) @ by_alignment).sum(axis=0)
-    of_place = lever_arm(place - centre)[:3]
-    return float(np.sqrt(variance * np.trace(of_place @ np.linalg.solve(information, of_place.T))))
+    of_target, of_places = (lever_arm(points - centre)[:, :3] for points in (target, places))
+    covariance = variance * np.linalg.inv((of_target.swapaxes(1, 2) @ of_target).sum(axis=0))
+    return np.asarray(np.sqrt((of_places @ covariance @ of_places.swapaxes(1, 2)).trace(axis1=1, axis2=2)))
 
 
 def _distances(T: FloatArray, source: FloatArray, target: FloatArray) -> FloatArray:
