@@ -182,7 +182,7 @@ IN_OPENCV_4_6 = """
     MORPH_OPEN REDUCE_AVG REDUCE_SUM RETR_LIST Sobel TERM_CRITERIA_EPS TERM_CRITERIA_MAX_ITER TM_CCOEFF_NORMED
     VideoCapture WARP_INVERSE_MAP
     __version__ absdiff addWeighted approxPolyDP arcLength aruco.getPredefinedDictionary blur circle compare contourArea
-    convertScaleAbs convexHull copyMakeBorder cvtColor distanceTransformWithLabels error fillConvexPoly
+    convertScaleAbs convexHull copyMakeBorder cvtColor dilate distanceTransformWithLabels error fillConvexPoly
     findContours fisheye.projectPoints fisheye.undistortPoints getNumThreads getPerspectiveTransform imdecode
     imreadmulti matchTemplate medianBlur morphologyEx polylines projectPoints putText reduce remap resize setNumThreads
     split subtract warpAffine warpPerspective

@@ -12,6 +12,7 @@ from thermal_fiducial.core.detection.finding.quads import (
     halfway,
     halved,
     Segmentation,
+    without_single_pixels,
 )
 
 SHAPE = 240, 320
@@ -96,6 +97,15 @@ def test_dark_cells_of_a_pixel_show_in_a_picture():
     mask = dark_in_picture(picture, 0.5)
     assert mask[50, 60] == 255
     assert np.count_nonzero(mask) == 1
+
+
+def test_single_pixels_are_no_outlines_to_follow():
+    mask = np.zeros(SHAPE, dtype=np.uint8)
+    cv2.fillConvexPoly(mask, QUAD.astype(np.int32), 255)
+    mask[20:22, 30] = 255
+    kept = mask.copy()
+    mask[10, 10] = mask[12, 11] = mask[0, 0] = 255
+    np.testing.assert_array_equal(without_single_pixels(mask), kept)
 
 
 def test_outlines_are_clockwise_and_large_enough():

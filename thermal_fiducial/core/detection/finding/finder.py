@@ -188,6 +188,8 @@ class MarkerFinder:
         """Markers by blind search, except those already ``found``."""
         polarities, allowed = history.polarities(config.polarity), self.allowed(known, config)
         blind = self._search.search(frame, allowed, config, found, scales, polarities)
+        if len(blind.ids) == 0:
+            return FoundMarkers.none()
         possible = (blind.cnr[:, None] * polarities > 0.0).any(axis=1)
         ids, corners = blind.ids[possible], blind.corners_px[possible]
         at, sizes = ImagePoints.at(corners, frame.camera), known.sizes[ids]
@@ -250,6 +252,8 @@ def _joined(found: FoundMarkers, others: FoundMarkers) -> FoundMarkers:
 
     The right half of marker 30 of DICT_4X4_50 is marker 17, seen from the side: only the whole explains both.
     """
+    if len(found.ids) == 0 or len(others.ids) == 0:
+        return others if len(found.ids) == 0 else found
     mine, theirs = found.places.points.px, others.places.points.px
     apart = np.linalg.norm(mine.mean(axis=1)[:, None] - theirs.mean(axis=1), axis=-1)
     together = apart <= TOGETHER * diagonals(mine)[:, None]

@@ -29,6 +29,8 @@ _SPECKS = 3
 # In a picture for a display: odd width of the surroundings, no wider than the white around the smallest markers; least
 # difference of a dark pixel from their mean [gray levels] and [standard deviations of the noise].
 _PICTURE_WINDOW_PX, _PICTURE_STEP, _PICTURE_NOISE = 5, 3.0, 2.0
+# The eight pixels around one.
+_NEIGHBOURS = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], dtype=np.uint8)
 # Where all markers have a high contrast: floor of the local standard deviation, largest deviation that counts for it
 # [standard deviations of the noise].
 _FLOOR_OF_CLEAR, _MOST_OF_CLEAR = 4.0, 300.0
@@ -133,6 +135,11 @@ def dark_in_picture(picture: Float32Array, noise: float) -> Gray:
     mean = np.asarray(cv2.blur(picture, (_PICTURE_WINDOW_PX, _PICTURE_WINDOW_PX)), dtype=np.float32)
     limit = mean - np.float32(max(_PICTURE_STEP, _PICTURE_NOISE * noise))
     return np.asarray(cv2.compare(picture, limit, cv2.CMP_LT), dtype=np.uint8)
+
+
+def without_single_pixels(mask: Gray) -> Gray:
+    """A mask without what is no marker, but thousands of outlines to follow: pixels without neighbours in it."""
+    return np.bitwise_and(mask, cv2.dilate(mask, _NEIGHBOURS), dtype=np.uint8)
 
 
 def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray, edge_px: float = 0.0) -> FloatArray:

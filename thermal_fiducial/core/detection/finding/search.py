@@ -16,6 +16,7 @@ from thermal_fiducial.core.detection.finding.quads import (
     halfway,
     halved,
     Segmentation,
+    without_single_pixels,
 )
 from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
 from thermal_fiducial.core.detection.prediction.frame import Frame
@@ -96,6 +97,8 @@ class BlindSearch:
         to_align = SearchScales.FAINT in scales
         reading, quads = self._read(frame, half, (fine, faint), allowed, found.ids if to_align else None)
         good = accepted(reading, frame.noise, self._decoder.correctable, config)
+        if not good.any():
+            return Outlines(reading.ids[good], quads[good], reading.contrast[good])
         good &= (squared_sides(quads) >= min_side_px**2).all(axis=1)
         good &= (frame.camera.contains(quads, CUT_OFF_PX) & frame.camera.shows(quads)).all(axis=1)
         good &= ~overlapped(reading, quads, good, distinct(reading, frame.noise, config))
@@ -134,7 +137,7 @@ class BlindSearch:
 
     def _fine_mask(self, frame: Frame, *, clear: bool) -> Gray:
         if frame.displayed:
-            return dark_in_picture(frame.image, frame.noise)
+            return without_single_pixels(dark_in_picture(frame.image, frame.noise))
         return self._fine.mask(frame.image, frame.noise, clear=clear)
 
     def _read(
