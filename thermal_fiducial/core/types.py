@@ -32,32 +32,38 @@ class Stacked:
 
     def only(self, keep: BoolArray | IntArray) -> Self:
         """Some of the items, by a mask (N,) or by their places."""
-        return self._changed(lambda values: values[keep])
+        places = keep.nonzero()[0] if keep.dtype == np.bool_ else keep
+        fields = self._fields()
+        for index, field in enumerate(fields):
+            if isinstance(field, np.ndarray):
+                # In a fourth of the time of an index.
+                fields[index] = field.take(places, axis=0)
+            elif isinstance(field, Stacked):
+                fields[index] = field.only(places)
+        return self._of(fields)
 
     def joined(self, others: Self) -> Self:
         """These items and those of ``others``."""
-        return self._changed(lambda *both: np.concatenate(both), others)
+        fields = self._fields()
+        for index, (field, theirs) in enumerate(zip(fields, others._fields(), strict=True)):
+            if isinstance(field, np.ndarray):
+                fields[index] = np.concatenate((field, theirs))
+            elif isinstance(field, Stacked):
+                fields[index] = field.joined(theirs)
+        return self._of(fields)
 
     def put(self, which: IntArray, others: Self) -> None:
         """Put ``others`` in the place of the items at ``which``, in their order."""
-        names: tuple[str, ...] = self.__slots__
-        for name in names:
-            field, theirs = getattr(self, name), getattr(others, name)
+        for field, theirs in zip(self._fields(), others._fields(), strict=True):
             if isinstance(field, Stacked):
                 field.put(which, theirs)
             elif isinstance(field, np.ndarray):
                 field[which] = theirs
 
-    def _changed(self, change: Callable[..., Any], *others: Self) -> Self:
-        """The batch with each array, also of batches in it, changed by what ``others`` have in its place."""
-        make: Callable[..., Self] = type(self)
+    def _fields(self) -> list[Any]:
         names: tuple[str, ...] = self.__slots__
-        fields = []
-        for name in names:
-            field, *theirs = (getattr(batch, name) for batch in (self, *others))
-            if isinstance(field, Stacked):
-                field = field._changed(change, *theirs)
-            elif isinstance(field, np.ndarray):
-                field = change(field, *theirs)
-            fields.append(field)
+        return [getattr(self, name) for name in names]
+
+    def _of(self, fields: list[Any]) -> Self:
+        make: Callable[..., Self] = type(self)
         return make(*fields)
