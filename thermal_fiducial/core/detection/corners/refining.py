@@ -164,19 +164,27 @@ def _by_patterns(
     frame: Frame, found: FoundMarkers, start: ImagePoints, blur: MotionBlur, decoder: Decoder
 ) -> RefinedCorners:
     """Corners of N markers by their whole patterns."""
-    # Each group is sampled alike.
     near = nearness(start.px, decoder.cells, np.hypot(frame.blur_px, blur.spread_px))
+    groups = np.unique(near).tolist()
+    if len(groups) == 1:
+        return _sampled_alike(frame, found, start, blur, groups[0], decoder)
     refined = RefinedCorners.none()
+    for nearer in groups:
+        which = near == nearer
+        group = found.only(which), start.only(which), blur.only(which)
+        refined = refined.joined(_sampled_alike(frame, *group, nearer, decoder))
+    return refined.only(_original_order(near))
+
+
+def _sampled_alike(
+    frame: Frame, found: FoundMarkers, start: ImagePoints, blur: MotionBlur, nearer: int, decoder: Decoder
+) -> RefinedCorners:
+    """Corners of N markers by their whole patterns, which are sampled as ``nearer`` of :func:`nearness` says."""
     # At rest the model of a bent gray scale contains its ends.
     saturation = None if blur.to_tails is None else frame.saturation
-    for nearer in np.unique(near):
-        which = near == nearer
-        corners, moving = start.only(which), blur.only(which)
-        bends = lens_bends(corners, frame.camera)
-        view = PatternView(frame.image, moving.to_tails, moving.spread, None, frame.displayed, bends, saturation)
-        fitted = fitted_patterns(frame, found.only(which), corners, moving.rolling, view, nearer, decoder)
-        refined = refined.joined(fitted)
-    return refined.only(_original_order(near))
+    bends = lens_bends(start, frame.camera)
+    view = PatternView(frame.image, blur.to_tails, blur.spread, None, frame.displayed, bends, saturation)
+    return fitted_patterns(frame, found, start, blur.rolling, view, nearer, decoder)
 
 
 def _original_order(groups: BoolArray | IntArray) -> IntArray:
