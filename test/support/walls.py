@@ -6,7 +6,7 @@ from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
-from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, screw_difference, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, screw_difference, skew, so3_exp, transform
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE, Odometry
 
@@ -42,12 +42,14 @@ def hung(rng, position, yaw, tilt=0.1):
 
 
 def look(position, target, roll=0.0):
-    """T_map_camera of a camera at ``position`` that looks at ``target``."""
+    """T_map_camera (..., 4, 4) of cameras at ``position`` (..., 3) that look at ``target``."""
     z = np.asarray(target, dtype=float) - position
-    z /= np.linalg.norm(z)
-    x = np.cross(z, [0.0, 0.0, 1.0])
-    x /= np.linalg.norm(x)
-    return transform(np.stack([x, np.cross(z, x), z], axis=-1) @ so3_exp([0.0, 0.0, roll]), position)
+    z /= np.linalg.norm(z, axis=-1, keepdims=True)
+    # The cross product of z and up.
+    x = np.stack([z[..., 1], -z[..., 0], np.zeros(z.shape[:-1])], axis=-1)
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    y = (skew(z) @ x[..., None])[..., 0]
+    return transform(np.stack([x, y, z], axis=-1) @ so3_exp(np.multiply.outer(roll, [0.0, 0.0, 1.0])), position)
 
 
 def mirrored(T_map_marker, T_map_camera):
@@ -59,15 +61,20 @@ def mirrored(T_map_marker, T_map_camera):
 
 
 def flight(t):
-    """T_map_camera of a slow flight in front of the wall at time ``t`` [s]."""
-    position = [-3.2 + 0.7 * np.sin(0.6 * t), 1.4 * np.sin(0.45 * t), 1.5 + 0.5 * np.sin(0.8 * t)]
-    return look(position, [0.0, 0.6 * np.sin(0.31 * t), 1.5 + 0.2 * np.sin(0.5 * t)], 0.1 * np.sin(0.7 * t))
+    """T_map_camera (..., 4, 4) of a slow flight in front of the wall at times ``t`` (...) [s]."""
+    position = _vectors(-3.2 + 0.7 * np.sin(0.6 * t), 1.4 * np.sin(0.45 * t), 1.5 + 0.5 * np.sin(0.8 * t))
+    return look(position, _vectors(0.0, 0.6 * np.sin(0.31 * t), 1.5 + 0.2 * np.sin(0.5 * t)), 0.1 * np.sin(0.7 * t))
 
 
 def brisk(t):
-    """T_map_camera at a time [s]: 1 m/s, and turns of 1 rad/s."""
-    T = look([-3.2, 0.5 * np.sin(2.0 * t), 1.5 + 0.2 * np.sin(1.3 * t)], [0.0, 0.0, 1.5])
-    return T @ transform(so3_exp([0.15 * np.sin(3.1 * t), 0.35 * np.sin(2.7 * t + 1.0), 0.05 * np.sin(t)]), np.zeros(3))
+    """T_map_camera (..., 4, 4) at times (...) [s]: 1 m/s, and turns of 1 rad/s."""
+    T = look(_vectors(-3.2, 0.5 * np.sin(2.0 * t), 1.5 + 0.2 * np.sin(1.3 * t)), [0.0, 0.0, 1.5])
+    turn = _vectors(0.15 * np.sin(3.1 * t), 0.35 * np.sin(2.7 * t + 1.0), 0.05 * np.sin(t))
+    return T @ transform(so3_exp(turn), np.zeros(3))
+
+
+def _vectors(x, y, z):
+    return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 
 
 def odometry(path, k, rng, twist_std=TWIST_STD):
@@ -86,7 +93,7 @@ def read_row_by_row(path, t, poses, readout, rng, lens=None):
     v = np.full((len(ids), 4), middle)
     for _ in range(4):
         instants = t + readout * (v / (CAMERA.height - 1) - 0.5)
-        T = np.stack([path(instant) for instant in instants.ravel()]).reshape(*v.shape, 4, 4)
+        T = path(instants)
         away = (points - T[..., :3, 3])[..., None, :]
         px = CAMERA.project((away @ T[..., :3, :3])[..., 0, :])
         v = px[..., 1]

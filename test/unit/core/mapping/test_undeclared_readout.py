@@ -286,7 +286,7 @@ def test_what_an_adjustment_takes_back_is_dropped():
 
 
 def test_another_map_needs_evidence_of_its_own():
-    mapper, _ = flown(brisk, 0.016)
+    mapper, _ = flown(brisk, 0.016, seconds=0.5)
     assert mapper.readout.estimate.seconds > 0.0
     mapper.reset()
     assert mapper.readout.estimate == ReadoutEstimate(0.0, CONFIG.readout_time_std)
