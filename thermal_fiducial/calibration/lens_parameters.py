@@ -5,8 +5,6 @@ import numpy as np
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray, IntArray
 
-# Step of the numerical derivative by the distortion coefficients, which are of order 0.01 to 1.
-_STEP = 1e-6
 # Shares of the distance from the centre by which the first radial term, a higher one and the tangential terms may move
 # the image's corner (standard deviations): lenses of 40 to 100 degrees have up to 0.3, 0.07 and 0.005.
 _FIRST, _HIGHER, _TANGENTIAL = 0.3, 0.1, 0.02
@@ -35,24 +33,19 @@ def by_parameters(camera: Camera, points: FloatArray, chosen: IntArray | None = 
 
     These are fx fy cx cy, the coefficients, and where the model has no tangential ones two that would decentre it.
     """
-    x = points[:, :2] / points[:, 2:]
     parameters = camera_parameters(camera)
     chosen = np.arange(MATRIX + len(prior_sigmas(camera))) if chosen is None else chosen
     J = np.zeros((len(points), 2, len(chosen)))
     focal = np.array([camera.K[0, 0], camera.K[1, 1]])
-    distorted = (camera.distort(x) - camera.principal_point) / focal
+    uv, by_coefficients = camera.distort_by_coefficients(points[:, :2] / points[:, 2:])
+    distorted = (uv - camera.principal_point) / focal
     for place, index in enumerate(chosen.tolist()):
         if index < MATRIX:
             J[:, index % 2, place] = distorted[:, index] if index < 2 else 1.0
-            continue
-        if index >= len(parameters):
+        elif index < len(parameters):
+            J[:, :, place] = by_coefficients[:, :, index - MATRIX]
+        else:
             J[:, :, place] = focal * _decentred(distorted, index - len(parameters))
-            continue
-        step = np.zeros(len(parameters))
-        step[index] = _STEP
-        # Without the check for points outside the lens's field, which costs more than the projection.
-        ahead, behind = (with_parameters(camera, parameters + sign * step).distort(x) for sign in (1.0, -1.0))
-        J[:, :, place] = (ahead - behind) / (2.0 * _STEP)
     return J
 
 

@@ -167,19 +167,27 @@ class Camera:
         x = np.asarray(normalised, dtype=np.float64)
         if not x.size:
             return x, np.zeros((*x.shape, 2))
-        points = np.empty((x.size // 2, 1, 3))
-        points[:, 0, :2], points[:, 0, 2] = x.reshape(-1, 2), 1.0
-        # At depth 1 its derivative by a translation of the camera is the one wanted. OpenCV leaves a skew of K out.
-        if self.model == 'equidistant':
-            distorted, J = cv2.fisheye.projectPoints(points, _STILL, _STILL, _EYE, self.D)
-            J = J[:, 11:13]
-        else:
-            distorted, J = cv2.projectPoints(points, _STILL, _STILL, _EYE, self.D)
-            J = J[:, 3:5]
+        uv, J = self._distorted(x)
+        # At depth 1 its derivative by a translation of the camera is the one wanted.
+        J = J[:, 11:13] if self.model == 'equidistant' else J[:, 3:5]
         # One product of matrices costs less than one for each point.
-        uv = distorted.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]
         by_x = J.reshape(-1, 4) @ self._focal_lengths_by_rows
         return uv.reshape(x.shape), by_x.reshape(*x.shape, 2)
+
+    def distort_by_coefficients(self, normalised: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """:meth:`distort` (N, 2) of (N, 2), and its derivative (N, 2, D) by the distortion coefficients [px]."""
+        uv, J = self._distorted(normalised)
+        first = 4 if self.model == 'equidistant' else 10
+        return uv, self.K[:2, :2] @ J[:, first : first + len(self.D)].reshape(len(uv), 2, -1)
+
+    def _distorted(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels (N, 2) of N normalised coordinates, and OpenCV's derivative (2 N, K) of them before K is applied."""
+        points = np.empty((x.size // 2, 1, 3))
+        points[:, 0, :2], points[:, 0, 2] = x.reshape(-1, 2), 1.0
+        # OpenCV leaves a skew of K out.
+        project = cv2.fisheye.projectPoints if self.model == 'equidistant' else cv2.projectPoints
+        distorted, J = project(points, _STILL, _STILL, _EYE, self.D)
+        return distorted.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2], np.asarray(J, np.float64)
 
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
         """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`."""

@@ -1,5 +1,7 @@
 """Camera models against OpenCV, and their inverses."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -74,6 +76,19 @@ def test_distortion_jacobian_is_the_difference_quotient(name):
     for k in range(2):
         d = h * np.eye(2)[k]
         assert np.allclose(J[..., k], (camera.distort(x + d) - camera.distort(x - d)) / (2 * h), rtol=1e-7, atol=1e-6)
+
+
+@every_model
+def test_derivatives_by_the_coefficients_are_difference_quotients(name):
+    camera, h = CAMERAS[name], 1e-6
+    x = camera.normalise(view_points(camera, 60, seed=4)[1])
+    uv, J = camera.distort_by_coefficients(x)
+    assert np.array_equal(uv, camera.distort(x))
+    assert J.shape == (60, 2, len(camera.D))
+    for column, step in enumerate(h * np.eye(len(camera.D))):
+        ahead, behind = (replace(camera, D=camera.D + sign * step).distort(x) for sign in (1.0, -1.0))
+        # Rounding of pixels by 1e-13, and second order.
+        assert np.allclose(J[:, :, column], (ahead - behind) / (2.0 * h), rtol=1e-6, atol=1e-6)
 
 
 @every_model
