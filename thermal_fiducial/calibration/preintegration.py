@@ -5,6 +5,7 @@ odometry", 2017, section VI, for all intervals at once.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import cv2
@@ -72,8 +73,12 @@ class ImuTrack:
         """
         after = np.clip(np.searchsorted(self.seconds, t), 1, len(self.seconds) - 1)
         apart = self.seconds[after] - self.seconds[after - 1]
-        variance = np.var(np.hstack([self.rate, self.force]), axis=0)
-        return np.asarray((apart * (apart > _GAP))[:, None] * variance)
+        return np.asarray((apart * (apart > _GAP))[:, None] * self._variance)
+
+    @cached_property
+    def _variance(self) -> FloatArray:
+        """(6,) of rate and force over all of the recording."""
+        return np.asarray(np.var(np.hstack([self.rate, self.force]), axis=0))
 
     def require_signals(self) -> None:
         """Raise InputError if an axis never changes: its sensor is dead, or the driver does not fill it in."""
