@@ -74,7 +74,9 @@ def brisk(t):
 
 
 def _vectors(x, y, z):
-    return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
+    vectors = np.empty((*np.shape(y), 3))
+    vectors[..., 0], vectors[..., 1], vectors[..., 2] = x, y, z
+    return vectors
 
 
 def odometry(path, k, rng, twist_std=TWIST_STD):
