@@ -17,6 +17,8 @@ from thermal_fiducial.core.measurements import CameraPose, ImuSample
 
 AT = 2.5
 LATE = 0.03
+#: Of the IMU [Hz] where nothing counts its samples: that of a slow autopilot, of which a flight takes half as long.
+RATE = 100.0
 #: A second of samples after the step is enough to follow it, two are asked for.
 FOLLOWED = AT + 1.0
 
@@ -30,7 +32,7 @@ def flown(step=0.0, late=LATE, pose_rate=30.0, wrong=False):
 
     ``wrong``: whether one pose is, later.
     """
-    flight = Flight(seed=3, seconds=5.0, pose_rate=pose_rate)
+    flight = Flight(seed=3, seconds=5.0, imu_rate=RATE, pose_rate=pose_rate)
     arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
     for pose in flight.poses:
         later = pose.stamp_ns - START_NS >= AT * 1e9
@@ -81,7 +83,7 @@ def test_a_step_by_whole_frames_is_followed_to_stamps_that_were_there_before(fra
 @pytest.mark.parametrize('step', [-0.1, pytest.param(0.3, marks=pytest.mark.nightly)])
 def test_a_step_is_known_no_better_than_the_delays_scatter(step):
     """By 20 ms, exponentially: what is taken out of the stamps is off by as much, and the offset finds the rest."""
-    flight, rng = Flight(seed=10, seconds=7.5), np.random.default_rng(10)
+    flight, rng = Flight(seed=10, seconds=7.5, imu_rate=RATE), np.random.default_rng(10)
     ekf = PoseEkf(config())
     states, lost = run_watched(ekf, stepping(flight, step, 4.0, lambda: rng.exponential(0.02)))
     off, _ = errors(flight, states, 4.0)
@@ -107,7 +109,7 @@ def test_the_numbers_of_a_pose_are_checked_once_also_at_a_step(monkeypatch):
     """Each was checked up to three times there: as it came, with the step taken out, and before it was inserted."""
     checked = []
     monkeypatch.setattr('thermal_fiducial.core.filter.ekf.require_pose', lambda T, what: checked.append(what))
-    ekf, arrivals = PoseEkf(config()), list(stepping(Flight(seed=3, seconds=FOLLOWED), 0.3))
+    ekf, arrivals = PoseEkf(config()), list(stepping(Flight(seed=3, seconds=FOLLOWED, imu_rate=RATE), 0.3))
     for item in arrivals:
         if isinstance(item, ImuSample):
             ekf.add_imu(item)
@@ -119,7 +121,7 @@ def test_the_numbers_of_a_pose_are_checked_once_also_at_a_step(monkeypatch):
 
 def test_an_unusable_pose_does_not_decide_on_a_step():
     """The fifth behind it, with which the first four would agree."""
-    flight, ekf = Flight(seed=3, seconds=FOLLOWED), PoseEkf(config())
+    flight, ekf = Flight(seed=3, seconds=FOLLOWED, imu_rate=RATE), PoseEkf(config())
     since = [pose.stamp_ns - START_NS for pose in flight.poses if pose.stamp_ns - START_NS >= AT * 1e9]
     for item in stepping(flight, 0.3):
         if isinstance(item, ImuSample):
@@ -156,7 +158,7 @@ def test_a_wrong_pose_is_no_step_although_all_are_later_than_they_were(late):
 @pytest.mark.parametrize('begins', [-2.0, 0.5, pytest.param(2.0, marks=pytest.mark.nightly)])
 def test_a_clock_that_is_set_soon_after_the_start_is_not_set_back_by_a_wrong_pose(begins):
     """By NTP or PTP, before it is known what delay is usual: a step back could not be used."""
-    flight = Flight(seed=1, seconds=10.0)
+    flight = Flight(seed=1, seconds=10.0, imu_rate=RATE)
     arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
     for k, pose in enumerate(flight.poses):
         arrives = pose.stamp_ns + round(1e9 * LATE)
@@ -174,7 +176,7 @@ def test_a_clock_that_is_set_soon_after_the_start_is_not_set_back_by_a_wrong_pos
 
 def test_a_verdict_has_the_stamp_that_came():
     """After a step too: the detector takes the clock offset from both stamps of ``camera_clock``."""
-    flight = Flight(seed=3, seconds=5.0)
+    flight = Flight(seed=3, seconds=5.0, imu_rate=RATE)
     ekf = PoseEkf(config())
     for arrival in stepping(flight, 0.3):
         if isinstance(arrival, ImuSample):
@@ -473,7 +475,7 @@ def test_a_step_by_one_frame_is_learned(rate, frames):
     # As good as before the step: one marker at 2 m. If the step is not suspected 5 to 20 cm.
     assert off.max() < 0.03
     # Poses do not contradict for longer than five of them take, which show the step.
-    assert lost[-len(off) :].sum() < 5 / rate * 200.0
+    assert lost[-len(off) :].sum() < 5 / rate * RATE
     assert ekf.resets == 0
     assert ekf.camera_time_offset == pytest.approx(-frames / rate, abs=1.5e-3)
 
@@ -528,7 +530,7 @@ def test_a_slow_camera_behind_a_faster_driver_needs_no_parameter(camera_hz, driv
     """Its stamps are those of the driver's ticks: late by up to the time between two of them, in turns."""
     tick_ns = 1_000_000_000 // driver_hz
     near = {'marker_distance': 1.0, 'translation_std': (0.0003, 0.0003, 0.003), 'rotation_std': (0.005, 0.005, 0.002)}
-    flight = Flight(seed=11, seconds=12.0, pose_rate=camera_hz, **near)
+    flight = Flight(seed=11, seconds=12.0, imu_rate=RATE, pose_rate=camera_hz, **near)
     even, uneven = (rms(stamped_by(flight, late)) for late in (lambda _: 0, lambda since_ns: -since_ns % tick_ns))
     # 1.1 to 1.6 times in eight flights each; with a jitter of 0.5 ms to begin with 5 to 100 times, and resets.
     assert uneven < 2.0 * even
