@@ -1,6 +1,7 @@
 """Lenses whose calibration is off by a smooth random function of the place in the image, and flights behind them."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -97,6 +98,14 @@ def _flown(seed, lens_px, frames, marker_map=None):
     return mapper, poses, located
 
 
+@cache
+def _mapped(seed, lens_px, frames):
+    """As :func:`_flown` without a map, and refined in the end; tests that share it change nothing of it."""
+    mapper, poses, located = _flown(seed, lens_px, frames)
+    mapper.refine(VIEWS)
+    return mapper, poses, located
+
+
 def bent_corridor(seed, lens_px, frames):
     """A map that grows along a corridor from one marker, behind a lens that is off by ``lens_px``.
 
@@ -104,8 +113,7 @@ def bent_corridor(seed, lens_px, frames):
     -------
     Rms error of the markers [m]; NEES per degree of freedom of the map in the end, and of the poses while it grew.
     """
-    mapper, poses, located = _flown(seed, lens_px, frames)
-    mapper.refine(VIEWS)
+    mapper, poses, located = _mapped(seed, lens_px, frames)
     markers = [marker for key, marker in mapper.map.markers.items() if key]
     of_map = [_nees(difference(m.T_map_marker, poses[m.id]), m.covariance) for m in markers]
     off = [np.linalg.norm(difference(m.T_map_marker, poses[m.id])[:3]) for m in markers]
@@ -119,7 +127,6 @@ def corridor_again(seed, lens_px, frames):
     -------
     Mean squared errors and claims of positions [m^2], and NEES per degree of freedom.
     """
-    mapper, _, _ = _flown(seed, lens_px, frames)
-    mapper.refine(VIEWS)
+    mapper, _, _ = _mapped(seed, lens_px, frames)
     _, _, located = _flown(seed, lens_px, frames, mapper.map)
     return np.mean(_errors_of(located), axis=1)
