@@ -1,9 +1,9 @@
 """An IMU on the simulated body: exact rates and specific force, errors of its axes, noise, errors of its stamps."""
 
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
-from scipy.signal import lfilter
 
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.sim.spline_trajectory import GRAVITY, MotionPath
@@ -159,5 +159,6 @@ class ImuModel:
         kept = np.exp(-1.0 / (self.rate * self.instability_time))
         driven = rng.normal(size=(count, 6))
         driven[1:] *= np.sqrt(1.0 - kept**2)
-        wander = lfilter([1.0], [1.0, -kept], driven, axis=0)
+        # Not by scipy.signal, whose import takes longer than all else that a rendering process loads.
+        wander = np.array(list(accumulate(driven, lambda last, new: kept * last + new)))
         return self.gyroscope_instability * wander[:, :3], self.accelerometer_instability * wander[:, 3:]
