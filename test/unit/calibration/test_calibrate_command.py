@@ -362,12 +362,20 @@ def test_reasons_that_differ_in_a_figure_are_one_in_the_error():
     )
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """For tests of what is printed: half of their time goes into drawings, which test_calibration_plots.py looks at."""
+    monkeypatch.setattr('thermal_fiducial.calibration.report.drawings', lambda *_: '')
+
+
+@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize(('tilt_deg', 'warns'), [(6.0, True), (35.0, False)])
 def test_a_focal_length_that_flat_views_leave_open_is_named(tmp_path, capsys, tilt_deg, warns):
     """The mapper takes 0.2 % where nothing else is said; twelve views tilted by up to 6 degrees leave 1.2 %."""
     assert ('focal_length_std: 0.' in _calibrated(tmp_path, capsys, tilt_deg)) == warns
 
 
+@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize(('shrunk', 'warns'), [(1, False), (4, True)])
 def test_a_principal_point_that_may_turn_the_camera_is_named(tmp_path, capsys, shrunk, warns):
     """Twelve views leave 0.8 px: 1.1 mrad at 760 px of focal length, 4 at 190 px. The filter takes 2 mrad."""
@@ -402,6 +410,7 @@ def _measured_views(tilt_deg, shrunk=1):
     return lines
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_a_calibration_that_is_there_is_kept_unless_forced(tmp_path, capsys):
     """A second run, of worse views say, replaced the calibration that the robot flies on."""
     source, out = tmp_path / 'points.csv', tmp_path / 'lens.yaml'
@@ -429,6 +438,7 @@ def test_calibrated_parameters_that_are_there_are_kept(tmp_path, capsys, action)
     assert out.read_text() == 'kept'
 
 
+@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize('points', [(40,), (0, 1, 2), (0, 1, 2, 3, 4, 5, 6), (0, 1, 2, 8)])
 def test_views_of_too_few_measured_points_are_named(tmp_path, capsys, points):
     """One of three was refused as "The number of points in the view #5 is < 4", one of a line without its name."""
