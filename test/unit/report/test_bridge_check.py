@@ -257,7 +257,7 @@ for name in ('rich', 'matplotlib', 'scipy', 'rosbags', 'jinja2', 'ezdxf'):
     sys.modules[name] = None
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.ros.watching import bridge_listener
-bridge_listener.DISCOVERY_S = 0.2
+bridge_listener.DISCOVERY_S, bridge_listener.SAID_S = 0.2, 0.1
 sys.exit(main(['check-bridge', '--seconds', '0.1', '--ros-args', '-r', '__ns:=/drone', '-r', 'imu/data:=imu/raw']))
 """
     done = finished(program)
