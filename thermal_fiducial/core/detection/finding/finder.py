@@ -14,6 +14,7 @@ from thermal_fiducial.core.detection.corners.focus import Focus
 from thermal_fiducial.core.detection.corners.gray_scale import GrayScale, UNKNOWN_SCALE
 from thermal_fiducial.core.detection.corners.refining import CLEAR_CNR
 from thermal_fiducial.core.detection.finding.drifted import drifted_markers
+from thermal_fiducial.core.detection.finding.parts import shown_by_known
 from thermal_fiducial.core.detection.finding.search import BlindSearch, large_aligned, SearchScales
 from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
 from thermal_fiducial.core.detection.prediction.frame import displacement_by_motion, Frame, Places, rolling_displacement
@@ -141,6 +142,8 @@ class MarkerFinder:
         if not holds and unfollowed is not None and guide is not None:
             missing = unfollowed.only(~among(unfollowed.ids, found.ids))
             found = _joined(found, self._drifted(frame, missing, guide, history, config))
+        if guide is not None:
+            found = found.only(~shown_by_known(found, known, guide.T_camera_map, frame.camera, self._decoder))
         return found, replace(history, searched_ns=frame.stamp_ns, scales=scales)
 
     def _guided(

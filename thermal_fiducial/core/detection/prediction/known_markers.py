@@ -133,6 +133,14 @@ class KnownMarkers:
         x, depth = points[..., :2] / points[..., 2:], points[..., 2]
         return ExpectedMarkers(self.ids[others][visible], x, depth, np.zeros(len(visible)))
 
+    def outlines(self, T_camera_map: FloatArray, camera: Camera) -> FloatArray:
+        """Predicted corners (K, 4, 2) of ``ids`` [px]; NaN for markers that the camera cannot show."""
+        rotated = self._corners_and_normals @ T_camera_map[:3, :3].T
+        points, normal = rotated[:, :4] + T_camera_map[:3, 3], rotated[:, 4]
+        corners = camera.project(points)
+        corners[~_faces_camera(points.mean(axis=1), normal)] = np.nan
+        return corners
+
     def partially_visible(
         self, T_camera_map: FloatArray, camera: Camera, without: IntArray
     ) -> list[tuple[int, FloatArray, float]]:
