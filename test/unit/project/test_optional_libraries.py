@@ -184,7 +184,7 @@ IN_OPENCV_4_6 = """
     __version__ absdiff addWeighted approxPolyDP arcLength aruco.getPredefinedDictionary blur circle compare contourArea
     convertScaleAbs convexHull copyMakeBorder cvtColor dilate distanceTransformWithLabels error fillConvexPoly
     findContours fisheye.projectPoints fisheye.undistortPoints getNumThreads getPerspectiveTransform imdecode
-    imreadmulti matchTemplate medianBlur morphologyEx perspectiveTransform pointPolygonTest polylines projectPoints
+    imreadmulti matchTemplate medianBlur morphologyEx perspectiveTransform polylines projectPoints
     putText reduce remap resize setNumThreads split subtract warpAffine warpPerspective
 """
 

@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.prediction.known_markers import among, FoundMarkers, KnownMarkers
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import areas
+from thermal_fiducial.core.geometry.reprojection import areas, diagonals
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
 # Least correlation of what a known marker shows with the one found there: outlines of parts are inaccurate.
@@ -28,21 +28,17 @@ def shown_by_known(
     T_camera_map : the camera by odometry
     """
     shown, px = np.zeros(len(found.ids), dtype=bool), found.places.points.px
-    unknown = np.flatnonzero(~among(found.ids, known.mapped))
-    if len(unknown) == 0:
+    unknown = ~among(found.ids, known.mapped)
+    if not unknown.any():
         return shown
-    outlines, size = known.outlines(T_camera_map, camera), areas(px)
-    larger = np.flatnonzero(np.isfinite(outlines).all(axis=(1, 2)))
-    for place in unknown.tolist():
-        middle = px[place].mean(axis=0).astype(np.float32).tolist()
-        for whole in larger[areas(outlines[larger]) > size[place]].tolist():
-            outline = outlines[whole].astype(np.float32)
-            if cv2.pointPolygonTest(outline, middle, measureDist=False) > 0:
-                image, drawn = _drawn(decoder, int(known.ids[whole]))
-                to_drawn = cv2.getPerspectiveTransform(outline, drawn)
-                within = np.asarray(cv2.perspectiveTransform(px[place][None], to_drawn), dtype=np.float64)
-                alike = decoder.correlation(image, within, found.ids[place : place + 1])
-                shown[place] |= alike[0] >= _ALIKE
+    outlines = known.outlines(T_camera_map, camera)
+    apart = np.linalg.norm(px.mean(axis=1)[:, None] - outlines.mean(axis=1), axis=-1)
+    within = (apart < 0.5 * diagonals(outlines)) & (areas(px)[:, None] < areas(outlines))
+    for place, whole in np.argwhere(within & unknown[:, None]).tolist():
+        image, drawn = _drawn(decoder, int(known.ids[whole]))
+        to_drawn = cv2.getPerspectiveTransform(outlines[whole].astype(np.float32), drawn)
+        corners = np.asarray(cv2.perspectiveTransform(px[place][None], to_drawn), dtype=np.float64)
+        shown[place] |= decoder.correlation(image, corners, found.ids[place : place + 1])[0] >= _ALIKE
     return shown
 
 
