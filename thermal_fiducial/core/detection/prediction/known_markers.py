@@ -123,23 +123,27 @@ class KnownMarkers:
         others = ~among(self.ids, without)
         if not others.any():
             return ExpectedMarkers.none()
-        rotated = self._corners_and_normals[others] @ T_camera_map[:3, :3].T
-        points, normal = rotated[:, :4] + T_camera_map[:3, 3], rotated[:, 4]
+        points, facing = self._in_camera(T_camera_map, others)
         corners = camera.project(points)
         large = (squared_sides(corners) >= min_side_px**2).all(axis=1)
         in_view = camera.contains(corners, CUT_OFF_PX).all(axis=1)
-        visible = np.flatnonzero(in_view & large & _faces_camera(points.mean(axis=1), normal))
+        visible = np.flatnonzero(in_view & large & facing)
         points = points[visible]
         x, depth = points[..., :2] / points[..., 2:], points[..., 2]
         return ExpectedMarkers(self.ids[others][visible], x, depth, np.zeros(len(visible)))
 
     def outlines(self, T_camera_map: FloatArray, camera: Camera) -> FloatArray:
         """Predicted corners (K, 4, 2) of ``ids`` [px]; NaN for markers that the camera cannot show."""
-        rotated = self._corners_and_normals @ T_camera_map[:3, :3].T
-        points, normal = rotated[:, :4] + T_camera_map[:3, 3], rotated[:, 4]
+        points, facing = self._in_camera(T_camera_map, np.ones(len(self.ids), dtype=bool))
         corners = camera.project(points)
-        corners[~_faces_camera(points.mean(axis=1), normal)] = np.nan
+        corners[~facing] = np.nan
         return corners
+
+    def _in_camera(self, T_camera_map: FloatArray, which: BoolArray) -> tuple[FloatArray, BoolArray]:
+        """Corners (N, 4, 3) [m] in the camera of N of the K expected markers, and which of these face it."""
+        rotated = self._corners_and_normals[which] @ T_camera_map[:3, :3].T
+        points = rotated[:, :4] + T_camera_map[:3, 3]
+        return points, _faces_camera(points.mean(axis=1), rotated[:, 4])
 
     def partially_visible(
         self, T_camera_map: FloatArray, camera: Camera, without: IntArray
