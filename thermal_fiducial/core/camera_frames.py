@@ -14,6 +14,9 @@ _COLUMNS = 9
 _ROWS = 64
 # Mean of Gaussian noise clipped at one standard deviation moves by the share of it within, 0.68, of a small offset.
 _CLIPPED = 1.0 / math.erf(math.sqrt(0.5))
+# Steps [their noise] of which clipping leaves less than a twentieth; recorded frames of three cameras have a fifth in
+# the mean, simulated ones a third. Largest number of rounds: with five, columns may differ by seven times their noise.
+_PROPORTIONAL, _ROUNDS = 0.5, 5
 
 
 def pixel_noise(counts: Pixels) -> float:
@@ -36,17 +39,27 @@ def with_columns_corrected(counts: Float32Array, noise: float) -> Float32Array:
     """``counts`` without the fixed-pattern offsets of its columns from their neighbours, in place.
 
     The steps from column to column, clipped at their noise so that the scene has little influence, add up to the
-    pattern. Of their sum, only what differs between neighbouring columns is certain.
+    pattern. Of their sum, only what differs between neighbouring columns is certain. Of steps that are larger than
+    their noise clipping leaves a part, which is taken out in turn (Newton's method for a Huber mean).
     """
     limit = np.float32(math.sqrt(2.0) * noise)
-    offsets = np.zeros((1, counts.shape[1]), dtype=np.float32)
+    for _ in range(_ROUNDS):
+        steps = _mean_steps(counts, limit)
+        offsets = np.pad(np.cumsum(steps, axis=1), ((0, 0), (1, 0)))
+        np.subtract(counts, offsets - cv2.blur(offsets, (_COLUMNS, 1)), out=counts)
+        if np.abs(steps).mean() < _PROPORTIONAL * limit:
+            break
+    return counts
+
+
+def _mean_steps(counts: Float32Array, limit: np.float32) -> Float32Array:
+    """Mean steps (1, width - 1) from each column to the next, of which each is clipped at ``limit``."""
+    steps = np.zeros((1, counts.shape[1] - 1), dtype=np.float32)
     for rows in np.split(counts, range(_ROWS, len(counts), _ROWS)):
-        steps = cv2.subtract(rows[:, 1:], rows[:, :-1])
-        np.clip(steps, -limit, limit, out=steps)
-        offsets[:, 1:] += cv2.reduce(steps, 0, cv2.REDUCE_SUM)
-    np.cumsum(_CLIPPED / len(counts) * offsets, axis=1, out=offsets)
-    offsets -= cv2.blur(offsets, (_COLUMNS, 1))
-    return np.subtract(counts, offsets, out=counts)
+        clipped = cv2.subtract(rows[:, 1:], rows[:, :-1])
+        np.clip(clipped, -limit, limit, out=clipped)
+        steps += cv2.reduce(clipped, 0, cv2.REDUCE_SUM)
+    return np.multiply(steps, _CLIPPED / len(counts), out=steps)
 
 
 class FramePeriod:

@@ -55,13 +55,15 @@ def test_at_half_the_resolution_of_odd_sizes_places_are_where_they_are(odd):
     np.testing.assert_array_equal(halved(image), halved(np.ascontiguousarray(image[:96, :128])))
 
 
-def test_offsets_of_columns_are_removed_and_the_scene_stays():
-    offsets = np.random.default_rng(1).normal(0.0, 0.5, SHAPE[1])
+@pytest.mark.parametrize('times_the_noise', [0.5, 2.5])
+def test_offsets_of_columns_are_removed_and_the_scene_stays(times_the_noise):
+    """Of offsets that are larger than the noise two thirds stayed."""
+    offsets = np.random.default_rng(1).normal(0.0, times_the_noise, SHAPE[1])
     scene = drawn(100.0, sigma=0.0)
     seen = (scene + noise(1.0) + offsets).astype(np.float32)
     left = with_columns_corrected(seen, 1.0) - scene
     columns = left.mean(axis=0)
-    # A ninth of the columns' own share stays, and what they have in common: 0.28 of the offsets when written.
+    # A ninth of the columns' own share stays, and what they have in common: 0.29 of the offsets when written.
     assert columns.std() < 0.4 * offsets.std()
     # The quadrilateral, a hundred times the noise, has moved no column by the noise.
     inside, outside = left[70:110, 90:120].mean(), left[150:, 90:120].mean()
