@@ -222,9 +222,9 @@ class JointFit:
         )
         (T, other), chi2, _ = self.fit.solve(np.stack([T, starts[0]]), weights, inlier=np.inf)
         scale = noise_factor(float(chi2[0]), 8 * len(weights) - 6)
-        if turn_between(T, other) > SAME_POSE and self._shown_from(other):
-            excess = float(chi2[1] - chi2[0]) / scale
-            return None if excess > DECISIVE else Alternative(other, excess, is_minimum=True)
+        excess = float(chi2[1] - chi2[0]) / scale
+        if turn_between(T, other) > SAME_POSE and excess <= DECISIVE and self._shown_from(other):
+            return Alternative(other, excess, is_minimum=True)
         turns = turn_between(T, starts)
         excesses = np.maximum(self.fit.costs(starts, weights, inlier=np.inf) - chi2[0], 0.0) / scale
         far = int(np.argmax(turns**2 * np.exp(-0.5 * excesses)))
