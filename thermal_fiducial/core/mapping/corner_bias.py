@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.core.error_model import INCONSISTENT_PX
-from thermal_fiducial.core.mapping.located import Location
+from thermal_fiducial.core.mapping.located import Location, not_taken_up
+from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray, Stacked, TINY
 
 #: What is known of the variance of the corners' bias at first, an inverse gamma distribution: a sum of squares [px^2]
@@ -41,36 +42,33 @@ class CornerBias:
         # Sums over frames: the weights of their markers, what is known of corners' own errors, and what residuals show.
         self._sums = np.zeros(7)
         #: the last frame, and its corners
-        self._last: tuple[Location, _FittedCorners] | None = None
+        self._last: tuple[CameraPose, _FittedCorners] | None = None
 
     def _weight(self, fitted: '_FittedCorners', shown: 'ShownErrors') -> float:
         """What a frame counts beside one of an exact map: the variance of a product is the square of the residuals'."""
-        corners, taken_up = fitted.corners, fitted.taken_up
+        corners = fitted.corners
         noise_variance = float(corners.shares**2 @ corners.noise_px**2) / len(corners.shares)
-        draws = corners.map_draws.reshape(len(taken_up), -1)
-        map_variance = float(np.mean(np.square(draws - taken_up @ (taken_up.T @ draws))))
+        of_map = not_taken_up(fitted.taken_up, corners.map_draws.reshape(len(fitted.taken_up), -1))
         expected = shown.own * noise_variance + shown.smooth * self.likely_px**2
-        return (expected / (expected + map_variance)) ** 2
+        return (expected / (expected + float(np.mean(np.square(of_map))))) ** 2
 
     def add(self, location: Location) -> None:
         """Update with the residuals of a located frame."""
-        corners = _WeightedCorners.of(location, self.likely_px)
-        before, self._last = self._last, (location, _FittedCorners.of(corners))
-        if before is None or location.pose.stamp_ns <= before[0].pose.stamp_ns:
+        pose, fitted = location.pose, _FittedCorners.of(_WeightedCorners.of(location, self.likely_px))
+        last, self._last = self._last, (pose, fitted)
+        if last is None or pose.stamp_ns <= last[0].stamp_ns:
             return
-        last = before[0]
-        places = {key: place for place, key in enumerate(last.pose.marker_ids)}
-        now = [place for place, key in enumerate(location.pose.marker_ids) if key in places]
-        then = [places[location.pose.marker_ids[place]] for place in now]
+        places = {key: place for place, key in enumerate(last[0].marker_ids)}
+        now = [place for place, key in enumerate(pose.marker_ids) if key in places]
         if len(now) < FEWEST_MARKERS:
             return
-        fitted, former_fitted = self._last[1].only(now), before[1].only(then)
-        residuals, former = fitted.residuals, former_fitted.residuals
-        shares = fitted.corners.shares * former_fitted.corners.shares
+        fitted, former = fitted.only(now), last[1].only([places[pose.marker_ids[place]] for place in now])
+        shares = fitted.corners.shares * former.corners.shares
         # Residuals of moved or mistaken markers are correlated too.
-        bounds = _bounds(_mean_products(residuals, former), min(INCONSISTENT_PX, BIAS_OUTLIER * self.likely_px))
-        shown, common = shown_errors(fitted, former_fitted, bounds)
-        known = shown.own * float(shares @ location.sight.observed.detector_px[now] ** 2) / len(now)
+        largest_px = min(INCONSISTENT_PX, BIAS_OUTLIER * self.likely_px)
+        bounds = _bounds(_mean_products(fitted.residuals, former.residuals), largest_px)
+        shown, common = shown_errors(fitted, former, bounds)
+        known = shown.own * float(np.mean(shares * fitted.corners.detector_px**2))
         common *= self._weight(fitted, shown)
         self._sums = BIAS_MEMORY * self._sums + common * np.array((shares.mean(), known, *shown))
         weight, known, *sums_shown = self._sums.tolist()
@@ -86,13 +84,6 @@ def _mean_products(residuals: FloatArray, former: FloatArray) -> FloatArray:
 def _bounds(products: FloatArray, largest_px: FloatArray | float) -> FloatArray:
     """(N,) weights of residuals by which no marker's mean product (N,) [px^2] exceeds the square of the largest."""
     return np.asarray(np.sqrt(np.minimum(1.0, largest_px**2 / np.maximum(np.abs(products), TINY))))
-
-
-def _refitted(residuals: FloatArray, J: FloatArray, shares: FloatArray) -> FloatArray:
-    """Residuals (N, 4, 2) [px] at the pose that N markers with weights ``shares`` (N,) fit best: J (N, 8, 6)."""
-    weights, J_all = np.repeat(shares, 8), J.reshape(-1, 6)
-    step = np.linalg.lstsq(weights[:, None] * J_all, weights * residuals.ravel(), rcond=None)[0]
-    return np.asarray(residuals - (J_all @ step).reshape(residuals.shape))
 
 
 def _by_mean_and_mode(squares: float, freedom: float) -> tuple[float, float]:
@@ -137,8 +128,9 @@ class _WeightedCorners(Stacked):
 
     #: (N,) weights: markers with more noise than the frame's median have less, and mistaken ones
     shares: FloatArray
-    #: (N,) standard deviation of a coordinate of their corners [px]
+    #: (N,) standard deviations of a coordinate of their corners, and of the detector's own errors in it [px]
     noise_px: FloatArray
+    detector_px: FloatArray
     #: (N, 4, 2) residuals [px] as located, and derivatives of the corners (N, 8, 6) by the pose
     located: FloatArray
     J: FloatArray
@@ -149,38 +141,46 @@ class _WeightedCorners(Stacked):
     @staticmethod
     def of(location: Location, bias_px: float) -> '_WeightedCorners':
         """All markers of a frame; ``bias_px`` is the standard deviation of the bias, as known by then."""
-        noise, fit = location.sight.noise_px, location.reprojection
+        sight, fit = location.sight, location.reprojection
+        noise = sight.noise_px
         by_noise = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2)
-        residuals = _refitted(fit.residuals, fit.J_camera, by_noise)
-        bounds = _bounds(_mean_products(residuals, residuals), BIAS_OUTLIER * np.hypot(noise, bias_px))
-        shares = by_noise * bounds
+        residuals, _ = _refitted(fit.residuals, fit.J_camera, by_noise)
+        shares = by_noise * _bounds(_mean_products(residuals, residuals), BIAS_OUTLIER * np.hypot(noise, bias_px))
         weights = shares[:, None, None]
-        map_draws = weights * (fit.J_marker @ location.sight.draws)
-        return _WeightedCorners(shares, noise, fit.residuals, fit.J_camera, weights * location.lens.modes, map_draws)
+        map_draws = weights * (fit.J_marker @ sight.draws)
+        return _WeightedCorners(
+            shares,
+            noise,
+            sight.observed.detector_px,
+            fit.residuals,
+            fit.J_camera,
+            weights * location.lens.modes,
+            map_draws,
+        )
 
 
 class _FittedCorners(NamedTuple):
-    """What the smooth error is at n weighted corners of a frame, and what the pose takes up of it."""
+    """Weighted corners of a frame at the pose that they alone fit best.
+
+    The located pose has odometry in it, and weights by the map, and what that displaces it is no error of the lens.
+    """
 
     corners: _WeightedCorners
-    #: (N, 4, 2) [px] at the pose that these corners alone fit best: the located pose has odometry in it, and weights by
-    #: the map, and what that displaces it is no error of the lens
+    #: (N, 4, 2) [px]
     residuals: FloatArray
-    #: (n, I) of either coordinate of all corners, and (I, I) products of these
-    modes: FloatArray
-    gram: FloatArray
-    #: (2 n, 6) orthonormal directions, along which the pose takes up weighted errors; (2 I, 6) by the smooth error's
-    #: factors
+    #: (8 N, 6) orthonormal directions, along which the pose takes up weighted errors
     taken_up: FloatArray
-    smooth_taken_up: FloatArray
+    #: (8 N, 2 I) what that leaves of the smooth error, by its factors in either coordinate, and (2 I, 2 I) products
+    smooth: FloatArray
+    gram: FloatArray
 
     @staticmethod
     def of(corners: _WeightedCorners) -> '_FittedCorners':
         """The fit of the pose to all ``corners``."""
-        modes = corners.modes.reshape(-1, corners.modes.shape[-1])
-        taken_up = np.linalg.qr((corners.shares[:, None, None] * corners.J).reshape(-1, 6))[0]
-        residuals = _refitted(corners.located, corners.J, corners.shares)
-        return _FittedCorners(corners, residuals, modes, modes.T @ modes, taken_up, _by_factors(modes, taken_up))
+        residuals, taken_up = _refitted(corners.located, corners.J, corners.shares)
+        by_coordinate = corners.modes[:, :, None, :, None] * np.eye(2)[:, None]
+        smooth = not_taken_up(taken_up, by_coordinate.reshape(len(taken_up), -1))
+        return _FittedCorners(corners, residuals, taken_up, smooth, smooth.T @ smooth)
 
     def only(self, chosen: list[int]) -> '_FittedCorners':
         """The fit to the markers at the places ``chosen``."""
@@ -189,41 +189,37 @@ class _FittedCorners(NamedTuple):
         return _FittedCorners.of(self.corners.only(np.array(chosen)))
 
 
-def _by_factors(modes: FloatArray, corners: FloatArray) -> FloatArray:
-    """(2 I, k) sums of (2 n, k) over the corners, by the factors of the smooth error: ``modes`` (n, I)."""
-    return np.asarray((modes.T @ corners.reshape(len(modes), -1)).reshape(-1, corners.shape[-1]))
+def _refitted(residuals: FloatArray, J: FloatArray, shares: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residuals (N, 4, 2) [px] at the pose that N markers with weights ``shares`` (N,) fit best: J (N, 8, 6).
+
+    And the orthonormal directions (8 N, 6) along which it takes up weighted errors.
+    """
+    weights = np.repeat(shares, 8)
+    taken_up = np.linalg.qr(weights[:, None] * J.reshape(-1, 6))[0]
+    left = not_taken_up(taken_up, weights * residuals.ravel()) / weights
+    return left.reshape(residuals.shape), taken_up
 
 
-def shown_errors(now: _FittedCorners, former: _FittedCorners, bound: FloatArray) -> tuple[ShownErrors, float]:
-    """What the residuals of n corners and the ``former`` ones of the same corners show.
+def shown_errors(now: _FittedCorners, former: _FittedCorners, bounds: FloatArray) -> tuple[ShownErrors, float]:
+    """What the residuals of N markers and the ``former`` ones of the same markers show.
 
     Parameters
     ----------
-    bound : (N,) further weights of the residuals of both
+    bounds : (N,) further weights of the residuals of both
 
     Returns
     -------
     that, and the share, 0 to 1, of the smooth error in the present residuals that was in the former ones
     """
-    n = len(now.modes)
-    r_now, r_former = ((bound * of.corners.shares * of.residuals.T).T.reshape(-1, 1) for of in (now, former))
-    common = now.taken_up.T @ former.taken_up
-    up_now, up_former = now.smooth_taken_up, former.smooth_taken_up
-    both_up = up_now.T @ up_former
-    smooth = 2.0 * np.vdot(now.modes, former.modes) + np.vdot(common, both_up)
-    crossed = _by_factors(former.modes, now.taken_up), _by_factors(now.modes, former.taken_up)
-    smooth -= np.vdot(up_now, crossed[0]) + np.vdot(up_former, crossed[1])
-    both = 2.0 * np.vdot(now.gram, former.gram) + np.vdot(both_up, both_up)
-    for gram, up in ((now.gram, up_former), (former.gram, up_now)):
-        of_coordinates = up.reshape(len(gram), -1)
-        both -= np.vdot(of_coordinates, gram @ of_coordinates)
+    r_now, r_former = (np.repeat(bounds * of.corners.shares, 8) * of.residuals.ravel() for of in (now, former))
+    count, common = len(r_now), now.taken_up.T @ former.taken_up
+    smooth = np.vdot(now.smooth, former.smooth)
     sums = (
-        np.vdot(r_now, r_former),
-        np.vdot(_by_factors(now.modes, r_now), _by_factors(former.modes, r_former)),
-        2.0 * n - 12.0 + np.vdot(common, common),
+        r_now @ r_former,
+        (r_now @ now.smooth) @ (r_former @ former.smooth),
+        count - 12.0 + np.vdot(common, common),
         smooth,
-        both,
+        np.vdot(now.gram, former.gram),
     )
-    alone = 2.0 * now.gram.trace() - np.vdot(up_now, up_now)
-    share = float(smooth) / max(float(alone), TINY)
-    return ShownErrors(*(float(value) / (2.0 * n) for value in sums)), min(max(share, 0.0), 1.0)
+    share = float(smooth) / max(float(now.gram.trace()), TINY)
+    return ShownErrors(*(float(value) / count for value in sums)), min(max(share, 0.0), 1.0)

@@ -270,3 +270,8 @@ def error_std_px(sight: Sight, reprojection: Reprojected, camera_covariance: Flo
     by_marker = np.einsum('nri,nri->n', reprojection.J_marker @ sight.map_covariances, reprojection.J_marker)
     variances = 2.0 * sight.noise_px**2 + np.nan_to_num(by_camera + by_marker) / 4.0 + INCONSISTENT_PX**2
     return np.asarray(np.sqrt(variances))
+
+
+def not_taken_up(directions: FloatArray, errors: FloatArray) -> FloatArray:
+    """``errors`` (n, ...) without their parts along orthonormal ``directions`` (n, 6), which a pose takes up."""
+    return np.asarray(errors - directions @ (directions.T @ errors))

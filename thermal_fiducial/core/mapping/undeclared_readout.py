@@ -27,7 +27,7 @@ from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, inverse_2
 from thermal_fiducial.core.geometry.planar_pose import INLIER, squareness
 from thermal_fiducial.core.geometry.reprojection import interaction, whitening
 from thermal_fiducial.core.geometry.se3 import turn_of_pose
-from thermal_fiducial.core.mapping.located import Location
+from thermal_fiducial.core.mapping.located import Location, not_taken_up
 from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.motion_prior import PredictedCamera
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS, TINY
@@ -134,8 +134,8 @@ class UndeclaredReadout:
         W_robust = roots[..., None] * W
         Q = np.linalg.qr((W_robust @ fit.J_camera.reshape(*squared.shape, 2, 6)).reshape(-1, 6))[0]
         # Derivatives (8 N, 6) by a displacement in the time that the pose does not take up.
-        left = _without(Q, (W_robust @ sight.observed.by_readout).reshape(-1, 6))
-        by_time, rest = left @ predicted.velocity, _without(Q, (roots * residuals).ravel())
+        left = not_taken_up(Q, (W_robust @ sight.observed.by_readout).reshape(-1, 6))
+        by_time, rest = left @ predicted.velocity, not_taken_up(Q, (roots * residuals).ravel())
         information, shown = float(by_time @ by_time), float(by_time @ rest)
         unsure = float(np.sum(left @ predicted.velocity_covariance(1.0) * left))
         chi2 = float(rest @ rest) - shown**2 / max(information, TINY)
@@ -198,8 +198,3 @@ def _depths(x: FloatArray, T_camera_marker: FloatArray) -> FloatArray:
     along_rays = np.sum(x * normal[..., :2], axis=-1) + normal[..., 2]
     depths = np.sum(normal * centre, axis=-1) / along_rays
     return np.where(np.isfinite(depths), depths, np.inf)
-
-
-def _without(Q: FloatArray, errors: FloatArray) -> FloatArray:
-    """``errors`` (n, ...) without their parts along the orthonormal directions ``Q`` (n, 6)."""
-    return np.asarray(errors - Q @ (Q.T @ errors))
