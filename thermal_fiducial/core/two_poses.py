@@ -73,15 +73,18 @@ def possible_poses(pose: CameraPose) -> list[CameraPose]:
     own -= covariance_of_one_error(half)
     # The camera moves along an arc about the marker, whose chord the covariance has.
     half[:3] /= np.sinc(np.linalg.norm(half[3:]) / np.pi)
-    poses = []
-    for step in (half, -half):
-        T = screwed(pose.T_map_camera, step)
-        # Errors of the corners stay what they are in the camera, those of the map what they are in the map.
-        with_map = lever_arm(T[:3, 3] - pose.T_map_camera[:3, 3])
-        of_map = with_map @ pose.map_covariance @ with_map.T
-        covariance = turned(own, so3_exp(step[3:])) + of_map
-        poses.append(replace(pose, T_map_camera=T, covariance=covariance, map_covariance=of_map))
-    return poses
+    return [along_screw(pose, step, own) for step in (half, -half)]
+
+
+def along_screw(pose: CameraPose, step: FloatArray, own: FloatArray) -> CameraPose:
+    """A pose moved by ``step`` (6,) along a screw, with ``own`` (6, 6) in its covariance beside the map's error.
+
+    Errors of the corners stay what they are in the camera, those of the map what they are in the map.
+    """
+    T = screwed(pose.T_map_camera, step)
+    with_map = lever_arm(T[:3, 3] - pose.T_map_camera[:3, 3])
+    of_map = with_map @ pose.map_covariance @ with_map.T
+    return replace(pose, T_map_camera=T, covariance=turned(own, so3_exp(step[3:])) + of_map, map_covariance=of_map)
 
 
 def unknown_turn(screw: FloatArray) -> FloatArray:

@@ -9,12 +9,13 @@ import numpy as np
 from thermal_fiducial.core.error_model import arms_of_scale, drawn_sum, INCONSISTENT_PX, LATE_DRAWS, NO_DRAWS
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise
-from thermal_fiducial.core.geometry.se3 import difference, lever_arm, screwed, turn_of_pose
+from thermal_fiducial.core.geometry.se3 import difference, lever_arm, so3_exp, turn_of_pose
 from thermal_fiducial.core.lens_errors import LensErrors
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, LATE, Observations, VAGUE
 from thermal_fiducial.core.motion_prior import PredictedCamera
+from thermal_fiducial.core.two_poses import along_screw
 from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked
 from thermal_fiducial.core.wording import listed, marker_names
 
@@ -133,19 +134,13 @@ class Location:
         return replace(self, pose=self.pose.widened(spread), noise=self.noise + spread, settled=False)
 
     def moved(self, step: FloatArray, unknown: FloatArray) -> 'Location':
-        """The location displaced by ``step`` (6,) along a screw, with what is ``unknown`` (6, 6) of it beside.
-
-        Errors of the corners stay what they are in the camera, those of the map what they are in the map.
-        """
-        before = self.pose.T_map_camera
-        T = screwed(before, step)
-        with_camera, with_map = turn_of_pose(T[:3, :3] @ before[:3, :3].T), lever_arm(T[:3, 3] - before[:3, 3])
-        of_map = with_map @ self.pose.map_covariance @ with_map.T
-        own = with_camera @ (self.pose.covariance - self.pose.map_covariance + unknown) @ with_camera.T
+        """The location displaced by ``step`` (6,) along a screw, with what is ``unknown`` (6, 6) of it beside."""
+        pose = along_screw(self.pose, step, self.pose.covariance - self.pose.map_covariance + unknown)
+        with_camera = turn_of_pose(so3_exp(step[3:]))
         return replace(
             self,
-            pose=replace(self.pose, T_map_camera=T, covariance=own + of_map, map_covariance=of_map),
-            map_gains=with_map @ self.map_gains,
+            pose=pose,
+            map_gains=lever_arm(pose.T_map_camera[:3, 3] - self.pose.T_map_camera[:3, 3]) @ self.map_gains,
             noise=with_camera @ (self.noise + unknown) @ with_camera.T,
             of_sides=with_camera @ self.of_sides,
             corner_gains=with_camera @ self.corner_gains,
