@@ -204,9 +204,10 @@ class JointFit:
         return replace(location.moved(step, unknown), settled=bool(shown.all()))
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> Alternative | None:
-        """The second solution of the planar ambiguity; where it merges with the first, the likeliest pose far from it.
+        """The second solution of the planar ambiguity; where none is found, the likeliest start far from the first.
 
-        None if the corners rule it out, or the markers would be smaller than a pixel from there.
+        Both may have merged, or the search may have ended where no marker is seen right. None if the corners rule it
+        out, or the markers would be smaller than a pixel from there.
         """
         heavy = found.weights >= _HEAVY * found.weights.max()
         extent = np.ptp(self.sight.observed.corners[heavy], axis=(0, 1)) / self.camera.focal_px
