@@ -155,7 +155,7 @@ def nearness(corners_px: FloatArray, cells: int, blurs_px: FloatArray) -> IntArr
     return np.maximum(np.rint(np.log2(np.maximum(apart, 1.0))), 0.0).astype(np.int64)
 
 
-def sample_grid(cell_px: FloatArray, cells: int, nearer: int = 0) -> PatternGrid:
+def sample_grid(cell_px: FloatArray, cells: int, nearer: int) -> PatternGrid:
     """Samples of markers of m x m ``cells``, which are so wide (N,), as ``nearer`` to the lines between cells."""
     density = max(_FEWEST, math.ceil(float(cell_px.max(initial=0.0)) / _APART_PX))
     return pattern_grid(cells, min(density, _MOST), nearer)
