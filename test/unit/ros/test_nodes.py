@@ -657,6 +657,21 @@ def test_an_invalid_camera_pose_is_refused(graph):
     assert 'unit quaternion' in graph.diagnose(node)[1]
 
 
+def test_a_refused_message_hides_no_error(graph):
+    """One in a second among 200 samples made a warning of a filter without a pose to fly on, and of a silent IMU."""
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
+    broken = imu(5)
+    broken.linear_acceleration.z = float('nan')
+    fly(graph, [imu(k) for k in range(5)] + [broken])
+    assert graph.diagnose(node)[:2] == (ERROR, 'IMU message that is not finite; waiting for markers')
+    lying = pose(0)
+    lying.pose.pose.orientation.w = 2.0
+    for _ in range(2):
+        fly(graph, [lying])
+        level, reason, _ = graph.diagnose(node)
+    assert (level, reason.partition('; ')[2]) == (ERROR, 'nothing on imu/data')
+
+
 @pytest.mark.parametrize(
     ('frame', 'map_frame', 'taken'),
     [('map', 'map', True), ('/map', 'map', True), ('', 'hall', True), ('odom', 'map', False), ('map', 'hall', False)],

@@ -272,11 +272,19 @@ class StageNode(CountingNode, Generic[Config]):
         return f'a second node is named {self.get_fully_qualified_name()}: was the launch file started twice?'
 
     def _level(self) -> tuple[bytes, str]:
-        """Level and message by precedence: deafness, faults, refused messages, missing main input, stage and rates."""
+        """Level and message by precedence: deafness, faults, refused messages, then those of input and stage.
+
+        A refused message hides no error: one among many says nothing of what the others have given.
+        """
         if faults := [*filter(None, (self.deaf, self._twin)), *self.faults]:
             return ERROR, '; '.join(faults)
+        level, reason = self._level_of_input_and_stage()
         if self.refused > self._diagnosed_refused:
-            return WARN, self.last_refusal
+            return (level, f'{self.last_refusal}; {reason}') if level == ERROR else (WARN, self.last_refusal)
+        return level, reason
+
+    def _level_of_input_and_stage(self) -> tuple[bytes, str]:
+        """Level and message by precedence: missing main input, stage and rates."""
         if self._rates.silent:
             return ERROR if self._rates.stopped else WARN, self._other_type or f'nothing on {self._rates.main}'
         level, reason = self.state()
