@@ -59,7 +59,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
             self._frames.add(stamp, sent=alone)
 
     def _on_camera_pose(self, message: bytes) -> None:
-        pose = self._corrections.in_present_map(message_bytes.camera_pose(message))
+        pose = self._corrections.in_present_map(message_bytes.camera_pose(message, self.config.map_frame))
         if self._T_map_pad is None or not self._frames.take(pose.stamp_ns):
             return
         if self.config.landing_target_frame == 'body':

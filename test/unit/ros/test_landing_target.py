@@ -61,8 +61,8 @@ def markers(*ids, stamp=STAMP):
     return clouds.cloud(rows, convert.header(stamp, 'thermal_camera_optical'))
 
 
-def camera_pose(stamp=STAMP):
-    head = convert.header(stamp, 'map')
+def camera_pose(stamp=STAMP, frame='map'):
+    head = convert.header(stamp, frame)
     return pose_with_covariance(T_MAP_BODY @ T_BODY_CAMERA, np.diag([1e-6] * 6), head)
 
 
@@ -107,6 +107,20 @@ def test_px4_gets_it_in_the_map_that_its_odometry_is_in(graph):
     (message,) = heard(graph)
     assert message.header.frame_id == 'map'
     np.testing.assert_allclose(convert.transform_of(message.pose)[:3, 3], PAD, atol=1e-6)
+
+
+@pytest.mark.parametrize('target_frame', ['body', 'map'])
+def test_a_camera_pose_in_another_frame_is_refused(graph, target_frame):
+    """Of another localizer on the same images, say: the pad went out where it is seen from that one's origin."""
+    node = graph.add(LandingTarget, landing_pad=[7, 8], landing_target_frame=target_frame, **EXTRINSICS)
+    graph.send('marker_map', marker_map(), profile=qos.LATCHED)
+    graph.send('markers', markers(8))
+    graph.send('camera_pose', camera_pose(frame='odom'))
+    level, reason, _ = graph.diagnose(node)
+    assert (level, "camera_pose in frame 'odom'" in reason) == (WARN, True)
+    assert not graph.heard['landing_target']
+    graph.send('camera_pose', camera_pose())
+    assert len(heard(graph)) == 1
 
 
 def test_a_frame_from_before_a_correction_of_the_map_has_the_pad_where_it_is(graph):
