@@ -80,7 +80,7 @@ MECHANISMS = {
         changes={'gyroscope_nonlinearity': 0.0, 'accelerometer_nonlinearity': 0.0},
     ),
     'what gaps hide': Mechanism(
-        ('gaps of imu', 'carpet_slow_circle'),
+        ('gaps of imu', 'stamped on arrival', 'carpet_slow_circle'),
         ('imu_noise:StructureFunction',),
         {'imu_noise:StructureFunction.interpolation_noise': lambda *_: (0.0, 0.0)},
     ),

@@ -244,6 +244,18 @@ def starved(seed: int) -> Arrivals:
     return Arrivals(flight, [item for _, item in arrivals], config())
 
 
+def stamped_on_arrival(seed: int) -> Arrivals:
+    """Samples of 200 Hz that come in fives and are stamped then, 10 ms early to late; four rotors shake them."""
+    flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
+    rotors = 2.0 * np.pi * rng.uniform(75.0, 95.0, (4, 1, 1)) * flight.t[:, None] + rng.uniform(0.0, 6.3, (4, 1, 6))
+    shaken = flight.imu + np.sin(rotors).sum(axis=0) * np.repeat((0.01, 0.4), 3)
+    samples = [
+        ImuSample(START_NS + round(25e6 * (k // 5) + 10e6 + 2e5 * (k % 5)), imu[:3], imu[3:])
+        for k, imu in enumerate(shaken)
+    ]
+    return _arrivals(flight, flight.poses, samples)
+
+
 def jittering(seed: int) -> Arrivals:
     """Stamps of the camera that are late by 2 ms in the mean, exponentially, and by 2 ms early."""
     flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
@@ -407,9 +419,9 @@ def returning(seed: int) -> Arrivals:
 def _scenes() -> dict[str, Scene]:
     flights = (
         brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, starved,
-        jittering, tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start, stepping_clock,
-        small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making, shaking_mount, poorly_mapped_markers,
-        shaken_start, returning,
+        stamped_on_arrival, jittering, tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start,
+        stepping_clock, small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making, shaking_mount,
+        poorly_mapped_markers, shaken_start, returning,
     )  # fmt: skip
     scenes: dict[str, Scene] = {scene.__name__.replace('_', ' '): partial(of_flights, scene) for scene in flights}
     # The clock's error over its claim takes more of them.

@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.filter.imu_input import GAP_NS
+from thermal_fiducial.core.filter.imu_input import GAP_NS, LOST_FACTOR
 from thermal_fiducial.core.types import FloatArray, SECOND_NS, TINY
 
 #: Time constant [s] of the mean force; motion is what differs from it.
@@ -80,9 +80,7 @@ class ImuNoiseMonitor:
         """(6,) densities for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
         self._floor.add(imu, seconds)
         self._motion.add(imu, seconds)
-        # Shorter steps are covered by the floor of the spectrum, once it has been measured.
-        covered = seconds <= _GAP and any(self._floor.densities)
-        between = (0.0, 0.0) if covered else self._motion.interpolation_noise(seconds)
+        between = (0.0, 0.0) if self._floor.covers(seconds) else self._motion.interpolation_noise(seconds)
         values = imu.tolist()
         rates, forces = values[:3], values[3:]
         motions = math.hypot(*rates), self._motion_of(forces, seconds)
@@ -179,6 +177,12 @@ class NoiseFloor:
         self._powers: deque[FloatArray] = deque(maxlen=_MEAN_OF)
         #: gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]; 0 until the first window is full
         self.densities = (0.0, 0.0)
+        #: longest step [s] of samples that are as even as a spectrum takes them for
+        self._longest_even = 0.0
+
+    def covers(self, seconds: float) -> bool:
+        """Whether the floor has been measured, and covers what lies in a step of ``seconds``."""
+        return seconds <= self._longest_even and any(self.densities)
 
     def add(self, imu: FloatArray, seconds: float) -> None:
         """Add a sample (6,) that follows the last one after ``seconds``; one behind a gap begins a new window."""
@@ -198,6 +202,7 @@ class NoiseFloor:
         differences = samples[:-2] - 2.0 * samples[1:-1] + samples[2:]
         count = len(differences)
         seconds = sum(self._seconds[2:]) / count
+        self._longest_even = min(LOST_FACTOR * seconds, _GAP)
         frequencies, window = np.fft.rfftfreq(count, seconds), np.hanning(count + 1)[:-1, None]
         spectrum = np.abs(np.fft.rfft(differences * window, axis=0)) ** 2
         # Power of second differences to squared density of the samples.
