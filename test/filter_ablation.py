@@ -73,6 +73,7 @@ MECHANISMS = {
     ),
     'scale of the gyroscope': Mechanism(('scale errors',), changes={'gyroscope_scale_std': 0.0}),
     'scale of the accelerometer': Mechanism(('scale errors',), changes={'accelerometer_scale_std': 0.0}),
+    'delay of the accelerometer': Mechanism(('filtered apart',), changes={'accelerometer_delay_std': 0.0}),
     'floor of the vibration': Mechanism(('shaken',), ('imu_noise:NoiseFloor',), changes={'vibration': 0.0}),
     'noise in motion': Mechanism(
         ('nonlinear',),

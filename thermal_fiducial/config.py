@@ -767,6 +767,14 @@ class ImuNoise(SelfChecked):
         minimum=0.0,
         maximum=0.1,
     )
+    accelerometer_delay_std: float = param(
+        0.01,
+        'Prior standard deviation of the delay of the accelerometer behind the gyroscope, by the low-pass filters of '
+        'either, which is estimated. 0: none.',
+        unit='s',
+        minimum=0.0,
+        maximum=0.1,
+    )
     gyroscope_nonlinearity: float = param(
         0.001,
         'Residual error of the gyroscope in motion (nonlinearity, bandwidth), relative to the rate.',

@@ -28,6 +28,7 @@ def difference(state, other):
             J @ (other.position - state.position),
             other.bias - state.bias,
             (other.scale - state.scale).ravel(),
+            [other.force_delay - state.force_delay],
             other.gravity[:2] - state.gravity[:2],
             [other.time_offset - state.time_offset],
             phi,
@@ -49,5 +50,6 @@ def any_estimate():
         position=np.array([4.0, 2.0, -1.0]),
         bias=0.01 * rng.normal(size=6),
         scale=0.01 * rng.normal(size=(2, 3, 3)),
+        force_delay=0.004,
     )
     return Estimate(1_000, state, A @ A.T, pose_noise=PoseNoise.of(ELSEWHERE))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.signal import butter, sosfilt, sosfilt_zi
 from scipy.stats import chi2
 
 from support import real_flights
@@ -256,6 +257,23 @@ def stamped_on_arrival(seed: int) -> Arrivals:
     return _arrivals(flight, flight.poses, samples)
 
 
+def filtered_apart(seed: int) -> Arrivals:
+    """An autopilot that filters the gyroscope at 80 Hz, the accelerometer at 10: 3 and 23 ms late."""
+    flight = Flight(seed=seed, seconds=16.0)
+    samples = []
+    passed = np.hstack((_low_pass(flight.imu[:, :3], 80.0), _low_pass(flight.imu[:, 3:], 10.0)))
+    for t, imu in zip(flight.t, passed, strict=True):
+        samples.append(ImuSample(START_NS + round(t * 1e9), imu[:3], imu[3:]))
+    return _arrivals(flight, flight.poses, samples)
+
+
+def _low_pass(samples: np.ndarray, cutoff: float) -> np.ndarray:
+    """Samples (N, 3) of 200 Hz behind a Butterworth filter of second order at ``cutoff`` [Hz], at rest before."""
+    sections = butter(2, cutoff, fs=200.0, output='sos')
+    at_rest = sosfilt_zi(sections)[:, :, None] * samples[0]
+    return sosfilt(sections, samples, axis=0, zi=at_rest)[0]
+
+
 def jittering(seed: int) -> Arrivals:
     """Stamps of the camera that are late by 2 ms in the mean, exponentially, and by 2 ms early."""
     flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
@@ -419,9 +437,9 @@ def returning(seed: int) -> Arrivals:
 def _scenes() -> dict[str, Scene]:
     flights = (
         brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, starved,
-        stamped_on_arrival, jittering, tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start,
-        stepping_clock, small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making, shaking_mount,
-        poorly_mapped_markers, shaken_start, returning,
+        stamped_on_arrival, filtered_apart, jittering, tilted_map, wrong_poses, twin_marker, moved_markers,
+        unknown_clock_at_start, stepping_clock, small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making,
+        shaking_mount, poorly_mapped_markers, shaken_start, returning,
     )  # fmt: skip
     scenes: dict[str, Scene] = {scene.__name__.replace('_', ' '): partial(of_flights, scene) for scene in flights}
     # The clock's error over its claim takes more of them.

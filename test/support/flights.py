@@ -153,8 +153,12 @@ def matched(**changes) -> PoseEkfConfig:
 
 
 def perfect(noise: ImuNoise) -> ImuNoise:
-    """An IMU of these densities and nothing else: no scale errors, no vibration, nothing that motion adds."""
-    without = ('gyroscope_scale_std', 'accelerometer_scale_std', 'gyroscope_nonlinearity', 'accelerometer_nonlinearity')
+    """An IMU of these densities and nothing else: no scale errors, no delay, no vibration, nothing that motion adds."""
+    scale, nonlinearity = (
+        ('gyroscope_scale_std', 'accelerometer_scale_std'),
+        ('gyroscope_nonlinearity', 'accelerometer_nonlinearity'),
+    )
+    without = (*scale, 'accelerometer_delay_std', *nonlinearity)
     return replace(noise, vibration=0.0, **dict.fromkeys(without, 0.0))
 
 

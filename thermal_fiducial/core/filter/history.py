@@ -48,7 +48,7 @@ class History:
     def __init__(self, config: PoseEkfConfig, camera_time_offset: float) -> None:
         #: dynamic parameters may change
         self.config = config
-        #: (54,) squared densities of the random walks
+        #: (55,) squared densities of the random walks
         self.walks = random_walks(config)
         self._kept_ns = round((config.max_delay + WINDOW_SECONDS) * SECOND_NS)
         self._offset_ns = round(camera_time_offset * SECOND_NS)

@@ -17,11 +17,16 @@ _CAPACITY = 1000
 
 
 class Steps(NamedTuple):
-    """N consecutive steps: mean sample ``imu`` (N, 6), ``seconds`` (N,), noise ``densities`` (N, 6)."""
+    """N consecutive steps.
+
+    Mean sample ``imu`` (N, 6), ``seconds`` (N,), noise ``densities`` (N, 6), derivative ``force_slope`` (N, 3) of the
+    specific force [m/s^3].
+    """
 
     imu: FloatArray
     seconds: FloatArray
     densities: FloatArray
+    force_slope: FloatArray
 
 
 class LastSample(NamedTuple):
@@ -112,7 +117,8 @@ class ImuBuffer:
             stamps_ns[0], stamps_ns[-1] = begin_ns, end_ns
         times_ns = np.array(stamps_ns)
         seconds = (times_ns[1:] - times_ns[:-1]) / SECOND_NS
-        return Steps(0.5 * (imu[:-1] + imu[1:]), seconds, self._rows[first + 1 : last + 1, 1])
+        slope = (imu[1:, 3:] - imu[:-1, 3:]) / seconds[:, None]
+        return Steps(0.5 * (imu[:-1] + imu[1:]), seconds, self._rows[first + 1 : last + 1, 1], slope)
 
     def at(self, time_ns: int) -> FloatArray:
         """(6,) sample at an instant, interpolated linearly."""

@@ -17,6 +17,7 @@ from thermal_fiducial.core.filter.state import (
     clock_offset_derivative,
     Estimate,
     EXTRINSICS,
+    FORCE_DELAY,
     GRAVITY,
     GYROSCOPE_BIAS,
     GYROSCOPE_MATRIX,
@@ -54,6 +55,7 @@ def blank_state(config: PoseEkfConfig) -> NavigationState:
         position=np.zeros(3),
         bias=np.zeros(6),
         scale=np.zeros((2, 3, 3)),
+        force_delay=0.0,
         gravity=np.array([0.0, 0.0, -config.gravity]),
         time_offset=0.0,
         T_body_camera=camera_in_body(config),
@@ -119,7 +121,7 @@ def _contradiction_of_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -
 
 
 def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatArray) -> FloatArray:
-    """Covariance (54, 54) by an unknown clock offset s; ``imu`` (6,) is the latest sample.
+    """Covariance (55, 55) by an unknown clock offset s; ``imu`` (6,) is the latest sample.
 
     The first pose measures the state at the camera's stamp, X(t + s) = X(t) Exp(derivative s).
     """
@@ -131,13 +133,14 @@ def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatA
 
 
 def _initial_variances(config: PoseEkfConfig) -> FloatArray:
-    """(54,) prior variances of all that the first pose does not measure."""
+    """(55,) prior variances of all that the first pose does not measure."""
     stds = np.zeros(SIZE)
     stds[VELOCITY] = config.initial_velocity_std
     stds[GYROSCOPE_BIAS] = config.initial_gyroscope_bias_std
     stds[ACCELEROMETER_BIAS] = config.initial_accelerometer_bias_std
     stds[GYROSCOPE_MATRIX] = config.imu.gyroscope_scale_std
     stds[ACCELEROMETER_MATRIX] = config.imu.accelerometer_scale_std
+    stds[FORCE_DELAY] = config.imu.accelerometer_delay_std
     stds[GRAVITY] = config.gravity * config.map_tilt_std
     stds[EXTRINSICS] = np.repeat((config.extrinsics_orientation_std, config.extrinsics_position_std), 3)
     return np.square(stds)

@@ -12,6 +12,7 @@ from thermal_fiducial.core.filter.history import History, STEPS
 from thermal_fiducial.core.filter.state import (
     CORE,
     Estimate,
+    FORCE_DELAY,
     GRAVITY,
     NavigationState,
     POSE,
@@ -238,5 +239,7 @@ def figures_of(history: History, main: Hypothesis, state: NavigationState) -> di
         'accelerometer bias': float(np.linalg.norm(state.bias[3:])),
         'gyroscope scale error': float(np.abs(state.scale[0]).max()),
         'accelerometer scale error': float(np.abs(state.scale[1]).max()),
+        'accelerometer delay': state.force_delay,
+        'accelerometer delay std': main.estimate.std(FORCE_DELAY),
         'map tilt': math.atan2(np.hypot(*state.gravity[:2]), -state.gravity[2]),
     }

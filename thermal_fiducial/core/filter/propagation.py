@@ -22,6 +22,7 @@ from thermal_fiducial.core.filter.state import (
     BIAS,
     CORE,
     Estimate,
+    FORCE_DELAY,
     GRAVITY,
     GYROSCOPE_BIAS,
     MOVED_BY,
@@ -75,7 +76,7 @@ def step_matrices(imu: FloatArray, seconds: FloatArray) -> StepMatrices:
 
 
 def random_walks(config: PoseEkfConfig) -> FloatArray:
-    """Squared densities (54,) of the random walks of the parameters."""
+    """Squared densities (55,) of the random walks of the parameters."""
     walks = np.zeros(SIZE)
     walks[GYROSCOPE_BIAS], walks[ACCELEROMETER_BIAS] = bias_walks(config.imu)
     walks[TIME_OFFSET] = config.time_offset_random_walk
@@ -83,9 +84,11 @@ def random_walks(config: PoseEkfConfig) -> FloatArray:
 
 
 def propagated(estimate: Estimate, steps: Steps, stamp_ns: int, walks: FloatArray) -> Estimate:
-    """The estimate after ``steps`` that end at ``stamp_ns``; ``walks`` (54,) of :func:`random_walks`."""
+    """The estimate after ``steps`` that end at ``stamp_ns``; ``walks`` (55,) of :func:`random_walks`."""
     state = estimate.state
     imu = state.corrected(steps.imu)
+    # A late reading of the force is that of an instant before.
+    imu[:, 3:] += state.force_delay * steps.force_slope
     matrices = step_matrices(imu, steps.seconds)
     R_map_body, velocity, position = _moved(state, matrices, imu, steps.seconds)
     transitions = _transitions(matrices, R_map_body, steps)
@@ -123,14 +126,16 @@ def _moved(
 
 
 def _transitions(matrices: StepMatrices, R_map_body: FloatArray, steps: Steps) -> FloatArray:
-    """(N, 9, 35) Jacobians of the core's error by the coordinates ``MOVED_BY``; ``R_map_body`` after each step."""
+    """(N, 9, 36) Jacobians of the core's error by the coordinates ``MOVED_BY``; ``R_map_body`` after each step."""
     dt = steps.seconds[:, None, None]
-    transitions = np.zeros((len(dt), 9, 35))
+    transitions = np.zeros((len(dt), 9, 36))
     transitions[..., CORE] = matrices.transition
     transitions[..., BIAS] = -matrices.by_imu
     # A scale error acts as a bias of scale times reading.
     shares = matrices.by_imu.reshape(-1, 9, 2, 3, 1) * steps.imu.reshape(-1, 1, 2, 1, 3)
     transitions[..., SCALES] = -shares.reshape(-1, 9, 18)
+    of_delay = matrices.by_imu[..., 3:] @ steps.force_slope[..., None]
+    transitions[..., FORCE_DELAY] = of_delay[..., 0]
     fallen = R_map_body[:, :2].swapaxes(-1, -2) * dt
     transitions[:, VELOCITY, GRAVITY] = fallen
     transitions[:, POSITION, GRAVITY] = fallen * (0.5 * dt)
@@ -151,7 +156,7 @@ def hovered(estimate: Estimate, densities: FloatArray, walks: FloatArray, second
     Parameters
     ----------
     densities : (6,) noise of gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]
-    walks : (54,) of :func:`random_walks`
+    walks : (55,) of :func:`random_walks`
     """
     if seconds == 0.0:
         return estimate
@@ -159,7 +164,12 @@ def hovered(estimate: Estimate, densities: FloatArray, walks: FloatArray, second
     # The reading that holds the robot still in the air, by the estimate.
     hover = np.concatenate((np.zeros(3), -state.gravity @ state.R_map_body))
     exact = replace(state, bias=np.zeros(6), scale=np.zeros((2, 3, 3)), velocity=np.zeros(3))
-    steps = Steps(np.tile(hover, (_STEPS, 1)), np.full(_STEPS, seconds / _STEPS), np.tile(densities, (_STEPS, 1)))
+    steps = Steps(
+        imu=np.tile(hover, (_STEPS, 1)),
+        seconds=np.full(_STEPS, seconds / _STEPS),
+        densities=np.tile(densities, (_STEPS, 1)),
+        force_slope=np.zeros((_STEPS, 3)),
+    )
     # What walks in a step counts from its middle on, not from its end.
     half = np.diag(walks * (0.5 * seconds / _STEPS))
     begun = replace(estimate, state=exact, covariance=estimate.covariance + half)

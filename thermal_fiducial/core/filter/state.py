@@ -25,19 +25,21 @@ ROTATION, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 GYROSCOPE_BIAS, ACCELEROMETER_BIAS, BIAS = slice(9, 12), slice(12, 15), slice(9, 15)
 #: scale and cross-axis error matrices of gyroscope and accelerometer, row by row [1],
 GYROSCOPE_MATRIX, ACCELEROMETER_MATRIX, SCALES = slice(15, 24), slice(24, 33), slice(15, 33)
+#: delay of the accelerometer behind the gyroscope [s],
+FORCE_DELAY = 33
 #: horizontal components of gravity in the map [m/s^2],
-GRAVITY = slice(33, 35)
+GRAVITY = slice(34, 36)
 #: clock offset [s],
-TIME_OFFSET = 35
+TIME_OFFSET = 36
 #: T_body_camera, perturbed from the left [rad, m]: consider parameters, whose values stay those of the parameters,
-EXTRINSICS = slice(36, 42)
+EXTRINSICS = slice(37, 43)
 #: systematic error of the camera poses, which lasts as long as the view, in the robot frame [rad, m],
-SYSTEMATIC = slice(42, 48)
+SYSTEMATIC = slice(43, 49)
 #: T_map_markers, moved from the left along a screw [m, rad]: how the map's error of poses changes with their markers.
-MARKERS = slice(48, 54)
-SIZE = 54
+MARKERS = slice(49, 55)
+SIZE = 55
 #: Coordinates that an IMU step propagates, and coordinates that they are propagated from.
-CORE, MOVED_BY = slice(0, 9), slice(0, 35)
+CORE, MOVED_BY = slice(0, 9), slice(0, 36)
 #: Core and bias of the gyroscope, whose errors those of the published odometry are.
 PUBLISHED = slice(0, 12)
 #: Coordinates that a pose measures.
@@ -58,6 +60,8 @@ class NavigationState:
     bias: FloatArray
     #: (2, 3, 3) errors of the measured rate and of the measured force, in shares of them
     scale: FloatArray
+    #: of the accelerometer behind the gyroscope [s]
+    force_delay: float
     #: (3,) in the map [m/s^2]
     gravity: FloatArray
     #: [s], t_imu = t_camera + camera_time_offset + time_offset
@@ -102,12 +106,12 @@ class NavigationState:
         )
 
     def moved_in_map(self, error: FloatArray) -> 'NavigationState':
-        """The state with its core and the map of the markers corrected by ``error`` (54,)."""
+        """The state with its core and the map of the markers corrected by ``error`` (55,)."""
         T_map_markers = screwed(np.eye(4), error[MARKERS]) @ self.T_map_markers
         return replace(self.moved(error[CORE]), T_map_markers=T_map_markers)
 
     def plus(self, error: FloatArray) -> 'NavigationState':
-        """The state corrected by ``error`` (54,): X Exp(xi) for the group part, a sum for the rest.
+        """The state corrected by ``error`` (55,): X Exp(xi) for the group part, a sum for the rest.
 
         The extrinsics stay as they are.
         """
@@ -115,6 +119,7 @@ class NavigationState:
             self.moved_in_map(error),
             bias=self.bias + error[BIAS],
             scale=self.scale + error[SCALES].reshape(2, 3, 3),
+            force_delay=self.force_delay + float(error[FORCE_DELAY]),
             gravity=with_horizontal(self.gravity, self.gravity[:2] + error[GRAVITY]),
             time_offset=self.time_offset + float(error[TIME_OFFSET]),
             systematic=self.systematic + error[SYSTEMATIC],
@@ -135,7 +140,7 @@ class NavigationState:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """State and covariance (54, 54) of its error at an instant in the clock of the IMU."""
+    """State and covariance (55, 55) of its error at an instant in the clock of the IMU."""
 
     stamp_ns: int
     state: NavigationState
@@ -146,7 +151,7 @@ class Estimate:
     clock: ClockEvidence = field(default_factory=ClockEvidence)
 
     def widened(self, error: FloatArray, std: float) -> 'Estimate':
-        """The estimate with an unknown multiple of an ``error`` (54,), of standard deviation ``std``."""
+        """The estimate with an unknown multiple of an ``error`` (55,), of standard deviation ``std``."""
         return replace(self, covariance=self.covariance + std**2 * np.outer(error, error))
 
     def std(self, place: slice | int) -> float:
@@ -155,7 +160,7 @@ class Estimate:
 
     @property
     def of_extrinsics(self) -> FloatArray:
-        """(54, 6) errors of the estimate by a standard deviation of each of the extrinsics."""
+        """(55, 6) errors of the estimate by a standard deviation of each of the extrinsics."""
         with_each = self.covariance[:, EXTRINSICS]
         stds = np.sqrt(with_each[EXTRINSICS].diagonal())
         return np.divide(with_each, stds, out=np.zeros_like(with_each), where=stds > 0.0)
@@ -169,14 +174,14 @@ class Estimate:
 
 
 def embedded_core(error: FloatArray) -> FloatArray:
-    """Error coordinates (54,) with the given core (9,), zero elsewhere."""
+    """Error coordinates (55,) with the given core (9,), zero elsewhere."""
     whole = np.zeros(SIZE)
     whole[CORE] = error
     return whole
 
 
 def clock_offset_derivative(derivative: FloatArray) -> FloatArray:
-    """(54,) error coordinates of 1 s of clock offset that leaves the state at the camera's stamps as it is.
+    """(55,) error coordinates of 1 s of clock offset that leaves the state at the camera's stamps as it is.
 
     ``derivative`` (9,): of the core, :meth:`NavigationState.derivative`.
     """

@@ -52,13 +52,13 @@ class Innovation(NamedTuple):
     derivative: FloatArray
     #: (3, 6, 6) covariances of the innovation by white errors of variance 1, in the order of :class:`PoseNoise`
     units: FloatArray
-    #: (6,) the innovation, its covariance S (6, 6) and the inverse, Jacobian H (6, 54), measurement noise R (6, 6)
+    #: (6,) the innovation, its covariance S (6, 6) and the inverse, Jacobian H (6, 55), measurement noise R (6, 6)
     value: FloatArray
     S: FloatArray
     S_inverse: FloatArray
     H: FloatArray
     R: FloatArray
-    #: (54, 6) errors of the prior by a standard deviation of each of the extrinsics; S (6, 6) if these were exact
+    #: (55, 6) errors of the prior by a standard deviation of each of the extrinsics; S (6, 6) if these were exact
     of_extrinsics: FloatArray
     S_exact: FloatArray
 
@@ -95,7 +95,7 @@ def mount_jacobian(state: NavigationState) -> FloatArray:
 
 
 def map_jacobian(state: NavigationState) -> FloatArray:
-    """(54, 6) derivative of the state by a motion of the map: rotation and position in the robot frame [rad, m]."""
+    """(55, 6) derivative of the state by a motion of the map: rotation and position in the robot frame [rad, m]."""
     J = np.zeros((SIZE, 6))
     J[POSE] = np.eye(6)
     J[VELOCITY, :3] = -skew(state.velocity_body)
@@ -140,7 +140,7 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
 
 
 def with_covariance(config: PoseEkfConfig, innovation: Innovation, covariance: FloatArray) -> Innovation:
-    """The innovation if the covariance (54, 54) of the estimate were another one."""
+    """The innovation if the covariance (55, 55) of the estimate were another one."""
     estimate = replace(innovation.estimate, covariance=covariance)
     return innovation_of(config, estimate, innovation.pose, innovation.motion)
 
@@ -171,7 +171,7 @@ def adapted_noise(innovation: Innovation) -> PoseNoise:
 
 
 def with_unknown_clock(config: PoseEkfConfig, covariance: FloatArray) -> FloatArray:
-    """Covariance (54, 54) with a clock offset as uncertain as after a step of the camera's clock; all else stays."""
+    """Covariance (55, 55) with a clock offset as uncertain as after a step of the camera's clock; all else stays."""
     covariance = covariance.copy()
     covariance[TIME_OFFSET], covariance[:, TIME_OFFSET] = 0.0, 0.0
     covariance[TIME_OFFSET, TIME_OFFSET] = (2.0 * config.time_offset_std) ** 2
@@ -280,7 +280,7 @@ def _clock_evidence(innovation: Innovation, by_pose: float) -> ClockEvidence:
 
 
 def _gain_and_covariance(innovation: Innovation) -> tuple[FloatArray, FloatArray, ClockEvidence]:
-    """Kalman update: the gain (54, 6), the covariance (54, 54), and what is known of the clock offset.
+    """Kalman update: the gain (55, 6), the covariance (55, 55), and what is known of the clock offset.
 
     The gain is that of exact extrinsics, so the estimate does not depend on how well they are said to be known; the
     covariance has all that their errors do to it.
@@ -305,7 +305,7 @@ def _gain_and_covariance(innovation: Innovation) -> tuple[FloatArray, FloatArray
 
 
 def _iterated(innovation: Innovation, gain: FloatArray) -> FloatArray:
-    """The corrected error (54,) by ``gain`` (54, 6), after a second Gauss-Newton step from the same prior.
+    """The corrected error (55,) by ``gain`` (55, 6), after a second Gauss-Newton step from the same prior.
 
     After seconds without poses the position may be off by metres. Rotation times position, the second order of the
     first step, is then larger than what the pose claims. (B. Bell, F. Cathey, "The iterated Kalman filter update as a

@@ -16,6 +16,8 @@ IMU = np.array([0.8, -1.5, 2.0, 3.0, -1.0, 9.0])
 DENSITIES = np.repeat((1.7e-4, 2.0e-3), 3)
 SECONDS, STEP_NS = 0.005, 5_000_000
 NO_WALKS = np.zeros(SIZE)
+#: Derivative of the force [m/s^3].
+SLOPE = np.array([30.0, -20.0, 40.0])
 
 
 @pytest.fixture
@@ -26,7 +28,8 @@ def estimate():
 def after(estimate, samples=IMU[None], densities=DENSITIES, walks=NO_WALKS):
     """The estimate after steps of equal length, one for each mean sample (N, 6)."""
     count = len(samples)
-    steps = Steps(np.asarray(samples), np.full(count, SECONDS), np.tile(densities, (count, 1)))
+    seconds, slopes = np.full(count, SECONDS), np.tile(SLOPE, (count, 1))
+    steps = Steps(np.asarray(samples), seconds, np.tile(densities, (count, 1)), slopes)
     return propagated(estimate, steps, estimate.stamp_ns + count * STEP_NS, walks)
 
 
@@ -58,7 +61,7 @@ def test_the_state_moves_by_the_error(estimate):
 def test_the_derivative_of_the_state_is_that_of_its_propagation(estimate):
     """X(t + s) = X(t) Exp(derivative s), for a robot that turns while it flies."""
     seconds = 1e-5
-    steps = Steps(IMU[None], np.array([seconds]), DENSITIES[None])
+    steps = Steps(IMU[None], np.array([seconds]), DENSITIES[None], np.zeros((1, 3)))
     later = propagated(estimate, steps, estimate.stamp_ns + 10_000, NO_WALKS).state
     found = difference(estimate.state, later)[CORE] / seconds
     # 1e-5 s of its own change, of up to 20 a second.
@@ -68,7 +71,7 @@ def test_the_derivative_of_the_state_is_that_of_its_propagation(estimate):
 def test_a_step_is_the_integral_of_the_motion(estimate):
     n = 20000
     dt = SECONDS / n
-    state = replace(estimate.state, bias=np.zeros(6), scale=np.zeros((2, 3, 3)))
+    state = replace(estimate.state, bias=np.zeros(6), scale=np.zeros((2, 3, 3)), force_delay=0.0)
     half = so3_exp(IMU[:3] * dt / 2)
     R, v, p = state.R_map_body, state.velocity, state.position
     for _ in range(n):
@@ -87,11 +90,26 @@ def test_the_pose_error_propagates_exactly_linearly(estimate):
     error[CORE] = np.random.default_rng(2).normal(size=9)
     other = replace(estimate, state=estimate.state.plus(error))
     samples = IMU + 0.3 * np.random.default_rng(3).normal(size=(4, 6))
-    matrices = step_matrices(estimate.state.corrected(samples), np.full(4, SECONDS))
+    corrected = estimate.state.corrected(samples)
+    corrected[:, 3:] += estimate.state.force_delay * SLOPE
+    matrices = step_matrices(corrected, np.full(4, SECONDS))
     expected = np.linalg.multi_dot(matrices.transition[::-1]) @ error[CORE]
     found = difference(after(estimate, samples).state, after(other, samples).state)[CORE]
     # half a radian and a metre of error: exact to double precision is the left-invariant error's promise
     np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_a_late_force_is_read_as_of_its_instant(estimate):
+    """A force that grows linearly, read 7 ms late, moves the robot as one that is read at once."""
+    grown = np.concatenate((np.zeros(3), SLOPE))
+    prompt = IMU + np.outer(SECONDS * np.arange(6), grown)
+    late = prompt - 0.007 * grown
+    exact = replace(estimate, state=replace(estimate.state, scale=np.zeros((2, 3, 3)), force_delay=0.0))
+    delayed = replace(estimate, state=replace(exact.state, force_delay=0.007))
+    # the same numbers but for the order of sums
+    np.testing.assert_allclose(
+        difference(after(exact, prompt).state, after(delayed, late).state)[CORE], 0.0, atol=1e-13
+    )
 
 
 @pytest.mark.parametrize('count', [1, 6])
