@@ -86,6 +86,9 @@ MECHANISMS = {
         {'imu_noise:StructureFunction.interpolation_noise': lambda *_: (0.0, 0.0)},
     ),
     'saturation': Mechanism(('saturated',), off={'imu_noise:_SATURATED': (0.0, 0.0)}),
+    'one bad sample': Mechanism(
+        ('bad samples',), ('imu_input:Jumps',), {'imu_input:Jumps.is_corrupt': lambda *_: False}
+    ),
     'frozen axes': Mechanism(('frozen',), ('imu_input:Axis',), {'imu_input:Axis.is_frozen': _first(False)}),
     'clock offset': Mechanism(
         ('slow and noisy', 'unknown clock at start'), changes={'estimate_time_offset': False, 'time_offset_std': 0.0}

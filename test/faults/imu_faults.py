@@ -24,6 +24,21 @@ def frozen(flight: Recorded) -> Stream:
     return Stream.of(during(flight.imu, lambda item: replace(item, value=last.value)), flight.frames)
 
 
+def now_and_then(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recorded], Stream]:
+    """A fault that changes single readings (6,), five in two seconds."""
+
+    def corrupt(item: Event) -> Event:
+        spoilt = round(item.sampled / 0.005) % 80 == 40
+        return replace(item, value=change(item.value.copy())) if spoilt else item
+
+    return lambda flight: Stream.of(during(flight.imu, corrupt), flight.frames)
+
+
+def at_full_scale(imu: np.ndarray) -> np.ndarray:
+    """What a failed transfer of ones and zeros reads: all six at the lower end of their range."""
+    return -_FULL_SCALE + 0.0 * imu
+
+
 def one_axis(axis: int, value: float) -> Callable[[Recorded], Stream]:
     """A fault by which one axis of six says ``value`` and nothing else."""
 

@@ -51,6 +51,8 @@ def _imu() -> list[Fault]:
         'one axis of the gyroscope dead (pitch)': imu_faults.one_axis(1, 0.0),
         'one axis of the accelerometer dead (forward)': imu_faults.one_axis(3, 0.0),
         'one axis of the accelerometer dead (up)': imu_faults.one_axis(5, 0.0),
+        'single samples at full scale': imu_faults.now_and_then(imu_faults.at_full_scale),
+        'single samples of zeros': imu_faults.now_and_then(np.zeros_like),
         'forces in g': imu_faults.scaled(1.0, 1.0 / 9.80665),
         'forces times 9.81': imu_faults.scaled(1.0, 9.80665),
         'rates in degrees': imu_faults.scaled(180.0 / np.pi, 1.0),

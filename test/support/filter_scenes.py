@@ -274,6 +274,15 @@ def _low_pass(samples: np.ndarray, cutoff: float) -> np.ndarray:
     return sosfilt(sections, samples, axis=0, zi=at_rest)[0]
 
 
+def bad_samples(seed: int) -> Arrivals:
+    """Five single samples at full scale."""
+    flight = Flight(seed=seed, seconds=16.0)
+    samples = flight.samples()
+    for k in range(1000, 3000, 400):
+        samples[k] = replace(samples[k], angular_velocity=np.full(3, -34.9), linear_acceleration=np.full(3, -156.9))
+    return _arrivals(flight, flight.poses, samples)
+
+
 def jittering(seed: int) -> Arrivals:
     """Stamps of the camera that are late by 2 ms in the mean, exponentially, and by 2 ms early."""
     flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
@@ -437,7 +446,7 @@ def returning(seed: int) -> Arrivals:
 def _scenes() -> dict[str, Scene]:
     flights = (
         brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, starved,
-        stamped_on_arrival, filtered_apart, jittering, tilted_map, wrong_poses, twin_marker, moved_markers,
+        stamped_on_arrival, filtered_apart, bad_samples, jittering, tilted_map, wrong_poses, twin_marker, moved_markers,
         unknown_clock_at_start, stepping_clock, small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making,
         shaking_mount, poorly_mapped_markers, shaken_start, returning,
     )  # fmt: skip

@@ -4,6 +4,7 @@ from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 import math
+from operator import gt
 
 from thermal_fiducial.core.filter.camera_clock import SMALLEST_STEP_NS
 from thermal_fiducial.core.measurements import Condition, ImuSample
@@ -26,6 +27,11 @@ IMPOSSIBLE_RANGES = 2.0
 #: of its longest run so far, which is due to quantisation: runs of up to 4 and 30 samples in two recorded IMUs. Before
 #: its first change it may be at rest, in a simulator without noise or behind a dead zone.
 FROZEN_SECONDS, FROZEN_SAMPLES, FROZEN_FACTOR = 0.045, 4, 3
+#: A sample is corrupt where it is farther from the one before than this multiple of the usual distance, unless the next
+#: one is as far: twelve flights of an independent renderer are within 8 times, three recordings within 9. Nearer than
+#: this [rad/s, m/s^2] it does no harm, 1 mrad and 10 mm/s over 5 ms. Usual is the mean of the last so many samples, and
+#: of this many at least.
+JUMP_FACTOR, LEAST_JUMPS, JUMP_MEMORY, FIRST_JUMPS = 10.0, (0.2, 2.0), 400, 20
 #: An accelerometer that stays at full scale for longer [s] is dead: impacts are over by then, and thrust is less than
 #: its range. A gyroscope may turn faster than its range for as long as it likes.
 SATURATED_SECONDS = 0.1
@@ -38,6 +44,8 @@ class Verdict(Enum):
     NOT_FINITE = Condition('IMU sample is not finite')
     IMPOSSIBLE = Condition('IMU sample far beyond the range of its sensors')
     FROZEN = Condition('IMU is frozen', 'the same value again and again')
+    EMPTY = Condition('IMU sample is zero', 'all six values')
+    CORRUPT = Condition('IMU sample far from those around it')
     REPEATED = Condition('IMU stamp repeated', 'two publishers, or a driver that sets none?')
     NO_CLOCK = Condition('IMU has no clock', NO_CLOCK)
     BACKWARD = Condition('IMU stamp went back')
@@ -77,6 +85,33 @@ class Axis:
         return seconds >= FROZEN_SECONDS and self._count >= too_many and self._longest > 0
 
 
+class Jumps:
+    """Distances of rate and force from sample to sample."""
+
+    def __init__(self) -> None:
+        self._last: list[float] = []
+        self._last_ns = 0
+        #: mean squares, of so many samples
+        self._usual, self._count = [0.0, 0.0], 0
+        self._one_left_out = False
+
+    def is_corrupt(self, stamp_ns: int, values: list[float]) -> bool:
+        """Whether a sample is far from the last one, and the first that is; what changes in a gap is not known."""
+        last = self._last or values
+        squares = [math.dist(values[:3], last[:3]) ** 2, math.dist(values[3:], last[3:]) ** 2]
+        limits = [max(JUMP_FACTOR**2 * usual, least**2) for usual, least in zip(self._usual, LEAST_JUMPS, strict=True)]
+        follows = 0 < stamp_ns - self._last_ns <= GAP_NS and self._count >= FIRST_JUMPS
+        far = follows and any(map(gt, squares, limits))
+        self._one_left_out = far and not self._one_left_out
+        if self._one_left_out:
+            return True
+        self._count = min(self._count + 1, JUMP_MEMORY)
+        changes = (square - usual for usual, square in zip(self._usual, squares, strict=True))
+        self._usual = [usual + change / self._count for usual, change in zip(self._usual, changes, strict=True)]
+        self._last_ns, self._last = stamp_ns, values
+        return False
+
+
 class ImuInput:
     """Gives a verdict on each sample.
 
@@ -92,6 +127,7 @@ class ImuInput:
         self._limits = [IMPOSSIBLE_RANGES * full_scale for full_scale in ranges]
         saturated = [math.inf] * 3 + [SATURATED_SECONDS] * 3
         self._axes = [Axis(*of_axis) for of_axis in zip(ranges, saturated, strict=True)]
+        self._jumps = Jumps()
         self._clock = StampClock()
         self._last_ns: int | None = None
         #: the last samples that were used, which may come once more
@@ -114,6 +150,8 @@ class ImuInput:
             return Verdict.NOT_FINITE
         if any(abs(value) > limit for value, limit in zip(values, self._limits, strict=True)):
             return Verdict.IMPOSSIBLE
+        if not any(values):
+            return Verdict.EMPTY
         if self._clock.shows_none(sample.stamp_ns):
             return Verdict.NO_CLOCK
         frozen = [axis.is_frozen(sample.stamp_ns, value) for axis, value in zip(self._axes, values, strict=True)]
@@ -130,7 +168,9 @@ class ImuInput:
         jump_ns = self._passed_again_ns(self._strays) if self._strays else 0
         self._used.append((sample.stamp_ns, values))
         self._follow(sample.stamp_ns, jump_ns)
-        return Verdict.RESTART if jump_ns else Verdict.USE
+        if jump_ns:
+            return Verdict.RESTART
+        return Verdict.CORRUPT if self._jumps.is_corrupt(sample.stamp_ns, values) else Verdict.USE
 
     def _passed_again_ns(self, run: StrayRun) -> int:
         """Jump back of the stamps [ns] whose ``run`` has now passed the last sample again; 0 if they had not jumped.

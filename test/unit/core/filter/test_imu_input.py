@@ -84,8 +84,47 @@ def test_an_axis_that_has_never_changed_is_at_rest(imu, noise):
     """A simulator without noise, before it takes off and once it hovers again."""
     still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.80665], (400, 1))
     assert set(verdicts(imu, still)) == {Verdict.USE}
-    assert set(verdicts(imu, noise(50), 400)) == {Verdict.USE}
+    # As a motion begins: more at once would be a jump.
+    assert set(verdicts(imu, still[:50] + 0.03 * noise(50), 400)) == {Verdict.USE}
     assert set(verdicts(imu, still, 450)) == {Verdict.USE}
+
+
+@pytest.mark.parametrize('axis', [2, 3])
+@pytest.mark.parametrize('size', [-100.0, 30.0])
+def test_one_sample_far_from_those_around_it_is_corrupt(imu, noise, axis, size):
+    """One at full scale turned a hover by 10 deg, and reset the filter."""
+    readings = 0.1 * noise(200)
+    readings[150, axis] = size / 10.0 if axis == 2 else size
+    found = verdicts(imu, readings)
+    assert [k for k, verdict in enumerate(found) if verdict is not Verdict.USE] == [150]
+    assert found[150] is Verdict.CORRUPT
+
+
+def test_where_motion_begins_one_sample_is_lost(imu, noise):
+    """The second one that is far from those before is believed; what is usual grows within some more."""
+    readings = 0.1 * noise(400)
+    readings[200:, 3] += 20.0
+    assert [k for k, verdict in enumerate(verdicts(imu, readings)) if verdict is not Verdict.USE] == [200]
+    shaken = verdicts(imu, 3.0 * noise(400), 400)
+    # Every second one at first: with 30 of 400 as far as that, ten times the mean is 2.7 times the new one.
+    assert shaken.count(Verdict.CORRUPT) < 15
+    assert set(shaken[60:]) == {Verdict.USE}
+
+
+def test_behind_a_gap_nothing_is_far(imu, noise):
+    readings = 0.1 * noise(300)
+    readings[200:, 3] += 20.0
+    assert set(verdicts(imu, readings[:200])) == {Verdict.USE}
+    # 100 ms; the end of a gap is believed with its third sample
+    assert verdicts(imu, readings[200:], 220) == [Verdict.AHEAD] * 2 + [Verdict.USE] * 98
+
+
+def test_a_sample_that_is_zero_has_not_been_read(imu, noise):
+    readings = noise(50)
+    readings[30] = 0.0
+    found = verdicts(imu, readings)
+    assert found[30] is Verdict.EMPTY
+    assert set(found[:30] + found[31:]) == {Verdict.USE}
 
 
 def excesses(imu, stamps_ms):
