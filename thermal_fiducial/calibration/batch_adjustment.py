@@ -14,6 +14,7 @@ from thermal_fiducial.calibration.banded_equations import BandedEquations
 from thermal_fiducial.calibration.preintegration import AXES, Densities, ImuTrack, preintegrate
 from thermal_fiducial.calibration.rig_state import horizontal, imu_errors, OF_ALL, OF_FRAME, State
 from thermal_fiducial.calibration.rolling import RowMoments
+from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -28,6 +29,10 @@ _INLIER = 4.1
 _BIAS_PRIOR = np.array([0.1] * 3 + [1.0] * 3)
 # Prior standard deviations of scale errors (diagonal entries) and misalignments [rad], by data sheets of small IMUs.
 _AXES_PRIOR = np.where(np.isin(np.arange(AXES), (0, 4, 8, 9, 11, 14)), 0.01, 0.005)
+# That of the delay of the accelerometer behind the gyroscope [s]: as in the filter.
+_DELAY_PRIOR = ImuNoise.accelerometer_delay_std
+# Of a low-pass filter at 5 Hz: beyond it an IMU is not late but wrong.
+_LARGEST_DELAY = 0.05
 # Standard deviation of the read-out time about zero: while it is estimated, and while it is held there [s].
 _READOUT_PRIOR, _READOUT_HELD = 0.05, 1e-12
 
@@ -39,7 +44,7 @@ class Solution:
     Parameters
     ----------
     state : all unknowns
-    covariance : (25, 25) of the shared ones, scaled by ``scale`` squared
+    covariance : (26, 26) of the shared ones, scaled by ``scale`` squared
     residuals : (N, 6) of the camera poses, position and rotation, in the map [m, rad]
     scale : factor on the given covariances that makes them consistent with the residuals
     jitter : standard deviation of the frames' stamps [s], estimated from the residuals
@@ -127,7 +132,7 @@ class Problem:
         return replace(solution, covariance=solution.covariance * np.outer(wider, wider) + shared @ shared.T)
 
     def _steps_by_systematic(self, state: State, of_samples: BandedEquations) -> FloatArray:
-        """Steps (25, K) of the shared unknowns by a standard deviation of each error that all poses share."""
+        """Steps (26, K) of the shared unknowns by a standard deviation of each error that all poses share."""
         normal = of_samples.copy()
         self._add_poses(state, normal)
         error, own, shared = self.pose_errors(state)
@@ -136,7 +141,7 @@ class Problem:
         return normal.steps_of_shared(np.swapaxes(own, 1, 2) @ off, np.einsum('nes,nek->sk', shared, off))
 
     def _step_without(self, state: State, of_samples: BandedEquations, first: int, last: int) -> FloatArray:
-        """Step (25,) of the shared unknowns without the frames from ``first`` to ``last``."""
+        """Step (26,) of the shared unknowns without the frames from ``first`` to ``last``."""
         problem = copy(self)
         problem._root = self._root.copy()
         problem._root[first:last] = 0.0
@@ -158,7 +163,7 @@ class Problem:
         return np.asarray(T_map_body @ se3.transform(state.R_body_camera, state.p_body_camera))
 
     def improved(self, state: State) -> tuple[State, float, FloatArray]:
-        """The next state, the largest change of a shared unknown, and the covariance (25, 25) of these."""
+        """The next state, the largest change of a shared unknown, and the covariance (26, 26) of these."""
         normal = self._of_samples(state)
         self._add_poses(state, normal)
         own, shared, covariance = normal.solved()
@@ -173,14 +178,16 @@ class Problem:
         prior = _READOUT_HELD if self._rows is None else _READOUT_PRIOR
         normal.C[9, 9] += 1.0 / prior**2
         normal.c[9] += state.readout / prior**2
-        normal.C[range(10, OF_ALL), range(10, OF_ALL)] += 1.0 / _AXES_PRIOR**2
-        normal.c[10:] += state.axes / _AXES_PRIOR**2
+        normal.C[10, 10] += 1.0 / _DELAY_PRIOR**2
+        normal.c[10] += state.force_delay / _DELAY_PRIOR**2
+        normal.C[range(11, OF_ALL), range(11, OF_ALL)] += 1.0 / _AXES_PRIOR**2
+        normal.c[11:] += state.axes / _AXES_PRIOR**2
         return normal
 
     def pose_errors(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Predicted minus measured (N, 6), and its derivatives by state (N, 6, 15) and shared unknowns (N, 6, 25)."""
+        """Predicted minus measured (N, 6), and its derivatives by state (N, 6, 15) and shared unknowns (N, 6, 26)."""
         count = len(state.p)
-        rate, _ = self._steady.corrected(state.axes).at(self._stamps + state.offset)
+        rate, _ = self._steady.corrected(state.axes, state.force_delay).at(self._stamps + state.offset)
         rate = rate - state.bias[:, :3]
         arm = state.p_body_camera
         R = state.R @ state.R_body_camera
@@ -240,9 +247,8 @@ class Problem:
         normal.add_shared(shared, e)
 
     def _add_imu(self, state: State, normal: BandedEquations) -> None:
-        increments = preintegrate(
-            self._imu.corrected(state.axes), self._stamps + state.offset, state.bias[:-1], self._noise
-        )
+        corrected, times = self._imu.corrected(state.axes, state.force_delay), self._stamps + state.offset
+        increments = preintegrate(corrected, times, state.bias[:-1], self._noise)
         e, first, second, shared = imu_errors(state, increments, self._noise)
         for index, J in ((slice(None, -1), first), (slice(1, None), second)):
             normal.add_states(index, J, shared, e)
@@ -250,7 +256,7 @@ class Problem:
         normal.add_shared(shared, e)
 
     def moved(self, state: State, own: FloatArray, shared: FloatArray) -> State:
-        """``state`` after a step of each frame's own unknowns (N, 15) and of the shared ones (25,)."""
+        """``state`` after a step of each frame's own unknowns (N, 15) and of the shared ones (26,)."""
         moved = replace(
             state,
             R=state.R @ se3.so3_exp(own[:, 3:6]),
@@ -261,14 +267,15 @@ class Problem:
             p_body_camera=state.p_body_camera + shared[3:6],
             gravity=se3.so3_exp(horizontal(state.gravity) @ shared[7:9]) @ state.gravity,
             readout=state.readout + shared[9],
-            axes=state.axes + shared[10:],
+            force_delay=float(np.clip(state.force_delay + shared[10], -_LARGEST_DELAY, _LARGEST_DELAY)),
+            axes=state.axes + shared[11:],
         )
         delay = float(np.clip(shared[6], -0.05, 0.05))
         return replace(self._shifted(moved, np.array([[delay]]), self._stamps), offset=state.offset + delay)
 
     def _shifted(self, state: State, delay: FloatArray, stamps: FloatArray) -> State:
         """States at ``stamps`` moved along their motion by ``delay`` (1,) or (N, 1) [s]."""
-        rate, force = self._imu.corrected(state.axes).at(stamps + state.offset + 0.5 * delay[:, 0])
+        rate, force = self._imu.corrected(state.axes, state.force_delay).at(stamps + state.offset + 0.5 * delay[:, 0])
         acceleration = (state.R @ (force - state.bias[:, 3:])[:, :, None])[:, :, 0] + state.gravity
         return replace(
             state,

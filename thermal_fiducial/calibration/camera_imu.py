@@ -5,8 +5,8 @@ states are linked by the preintegrated IMU samples between them, and to the map 
 The times of the states are the camera's stamps plus the offset; a change of the offset moves them along their velocity,
 and the samples are preintegrated again. J. Rehder et al., "Extending kalibr", ICRA 2016, estimates the same quantities
 with splines, including scale errors and misalignments of the IMU: neglected, half a per cent of these biases the lever
-arm by millimetres. The read-out time is observable in the corners of each frame, and in the delay of poses with the
-rows that they are computed from.
+arm by millimetres, and so does an accelerometer that is filtered more than the gyroscope, 20 ms late. The read-out time
+is observable in the corners of each frame, and in the delay of poses with the rows that they are computed from.
 """
 
 from collections.abc import Sequence
@@ -54,6 +54,7 @@ class CameraImuCalibration:
     stamp_jitter : standard deviation of the camera's stamps about the time offset [s]
     gravity_map : (3,) [m/s^2]
     bias : (6,) mean gyroscope and accelerometer bias
+    force_delay, force_delay_sigma : of the accelerometer behind the gyroscope [s], and its standard deviation
     axes : (15,) scale errors and misalignments of the IMU, as :func:`preintegration.axis_errors` has them
     axes_sigma : (15,) their standard deviations
     residuals : (N, 6) of the camera poses, position and rotation, in the map [m, rad]
@@ -69,6 +70,8 @@ class CameraImuCalibration:
     stamp_jitter: float
     gravity_map: FloatArray
     bias: FloatArray
+    force_delay: float
+    force_delay_sigma: float
     axes: FloatArray
     axes_sigma: FloatArray
     residuals: FloatArray
@@ -292,6 +295,8 @@ def _answer(solution: Solution, readout_sigma: float) -> CameraImuCalibration:
         solution.jitter,
         state.gravity,
         state.bias.mean(axis=0),
+        state.force_delay,
+        float(np.sqrt(solution.covariance[10, 10])),
         state.axes,
         np.sqrt(np.diag(solution.covariance)[-AXES:]),
         solution.residuals,

@@ -59,12 +59,14 @@ class ImuTrack:
 
     def at(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rate and force (..., 3) at times ``t``, linear between samples."""
-        flat = t.reshape(-1)
-        rate, force = (
-            np.stack([np.interp(flat, self.seconds, signal[:, axis]) for axis in range(3)], axis=-1)
-            for signal in (self.rate, self.force)
-        )
-        return rate.reshape(*t.shape, 3), force.reshape(*t.shape, 3)
+        return self._interpolated(self.rate, t), self._interpolated(self.force, t)
+
+    def slope_at(self, t: FloatArray) -> FloatArray:
+        """Derivative (..., 3) of the specific force at times ``t`` [m/s^3]."""
+        return self._interpolated(self.force_slope, t)
+
+    def _interpolated(self, signal: FloatArray, t: FloatArray) -> FloatArray:
+        return np.stack([np.interp(t, self.seconds, signal[:, axis]) for axis in range(3)], axis=-1)
 
     def hidden(self, t: FloatArray) -> FloatArray:
         """Noise densities (N, 6), squared, of what samples are interpolated over at times ``t`` (N,); 0 outside gaps.
@@ -92,10 +94,19 @@ class ImuTrack:
         rate, force = (np.asarray(cv2.blur(signal, (1, width)), np.float64) for signal in (self.rate, self.force))
         return ImuTrack(self.seconds, rate, force)
 
-    def corrected(self, axes: FloatArray) -> 'ImuTrack':
-        """Samples without the scale errors and misalignments ``axes`` (15,), see :func:`axis_errors`."""
-        by_axes = axis_errors(self.rate, self.force) @ axes
-        return ImuTrack(self.seconds, self.rate - by_axes[:, :3], self.force - by_axes[:, 3:])
+    @cached_property
+    def force_slope(self) -> FloatArray:
+        """(N, 3) derivative of the specific force [m/s^3]."""
+        return np.asarray(np.gradient(self.force, self.seconds, axis=0))
+
+    def corrected(self, axes: FloatArray, force_delay: float) -> 'ImuTrack':
+        """Samples without the scale errors and misalignments ``axes`` (15,), see :func:`axis_errors`, at one time.
+
+        ``force_delay``: of the force behind the rate [s].
+        """
+        prompt = self.force + force_delay * self.force_slope
+        by_axes = axis_errors(self.rate, prompt) @ axes
+        return ImuTrack(self.seconds, self.rate - by_axes[:, :3], prompt - by_axes[:, 3:])
 
     def noise(self, known: ImuNoise) -> SampleNoise:
         """``known`` with the white noise estimated from the samples, where vibration increases it."""
@@ -135,6 +146,7 @@ class Increments:
     R, v, p : rotation (3, 3), velocity and position increments in the body frame at the interval's start
     by_bias : (9, 6) derivative of (rotation, velocity, position) by gyroscope and accelerometer bias
     by_axes : (9, 15) by scale errors and misalignments
+    by_delay : (9,) by the delay of the accelerometer behind the gyroscope
     covariance : (9, 9) of the same
     """
 
@@ -144,6 +156,7 @@ class Increments:
     p: FloatArray
     by_bias: FloatArray
     by_axes: FloatArray
+    by_delay: FloatArray
     covariance: FloatArray
 
 
@@ -159,7 +172,8 @@ def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: Dens
     # Of each interval its own: the long one while no marker is in view leaves the others as they are.
     steps = np.maximum(1, np.ceil(dt / _STEP).astype(np.int64))
     R, v, p = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((count, 3))
-    by_bias, by_axes, covariance = np.zeros((count, 9, 6)), np.zeros((count, 9, AXES)), np.zeros((count, 9, 9))
+    by_bias, by_axes = np.zeros((count, 9, 6)), np.zeros((count, 9, AXES))
+    by_delay, covariance = np.zeros((count, 9, 1)), np.zeros((count, 9, 9))
     density = np.array([noise.gyroscope_noise_density] * 3 + [noise.accelerometer_noise_density] * 3) ** 2
     for step in range(int(steps.max())):
         on = np.flatnonzero(steps > step)
@@ -174,13 +188,14 @@ def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: Dens
         # Bias enters like noise, with the opposite sign, as it is subtracted from the sample.
         by_bias[on] = transition @ by_bias[on] - inputs
         by_axes[on] = transition @ by_axes[on] - inputs @ axes
+        by_delay[on] = transition @ by_delay[on] + inputs[:, :, 3:] @ imu.slope_at(t)[:, :, None]
         covariance[on] = transition @ covariance[on] @ np.swapaxes(transition, 1, 2)
         covariance[on] += inputs @ (((density + imu.hidden(t)) / h)[:, :, None] * np.swapaxes(inputs, 1, 2))
         a = (middle @ force[:, :, None])[:, :, 0]
         p[on] += v[on] * h + 0.5 * a * h**2
         v[on] += a * h
         R[on] = middle @ half
-    return Increments(dt, R, v, p, by_bias, by_axes, covariance)
+    return Increments(dt, R, v, p, by_bias, by_axes, by_delay[:, :, 0], covariance)
 
 
 def _linearised(

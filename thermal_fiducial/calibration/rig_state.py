@@ -12,8 +12,8 @@ from thermal_fiducial.errors import InputError
 #: Number of unknowns of a frame: position, rotation, velocity, biases.
 OF_FRAME = 15
 #: Number of shared unknowns: rotation and position of the camera in the body, time offset, direction of gravity,
-#: read-out time, scale errors and misalignments of the IMU.
-OF_ALL = 10 + AXES
+#: read-out time, delay of the accelerometer behind the gyroscope, scale errors and misalignments of the IMU.
+OF_ALL = 11 + AXES
 #: Largest time offset that is searched [s].
 LARGEST_OFFSET = 0.15
 _COARSE_STEP = 0.002
@@ -35,6 +35,7 @@ class State:
     offset: float
     gravity: FloatArray
     readout: float = 0.0
+    force_delay: float = 0.0
     axes: FloatArray = field(default_factory=lambda: np.zeros(AXES))
 
 
@@ -107,7 +108,8 @@ def imu_errors(
     first[:, :9, 9:] = -increments.by_bias
     first[:, 9:, 9:], second[:, 9:, 9:] = -np.eye(6), np.eye(6)
     by_gravity = -se3.skew(gravity) @ horizontal(gravity)
-    shared[:, :9, 10:] = -increments.by_axes
+    shared[:, :9, 10] = -increments.by_delay
+    shared[:, :9, 11:] = -increments.by_axes
     shared[:, 3:6, 7:9] = -R0t @ by_gravity * dt[:, :, None]
     shared[:, 6:9, 7:9] = -0.5 * R0t @ by_gravity * dt[:, :, None] ** 2
     root = np.zeros((count, OF_FRAME, OF_FRAME))

@@ -202,6 +202,8 @@ def _extrinsics_text(result: 'CameraImuCalibration') -> str:
             f'{left_mm.max():.2f} mm at worst; noise {result.scale:.2f} of the expected',
             f'# scale errors of the gyroscope [%]: {_percent(result, (0, 4, 8))}',
             f'# scale errors of the accelerometer [%]: {_percent(result, (9, 11, 14))}',
+            f'# accelerometer behind the gyroscope: {1e3 * result.force_delay:.2f} +- '
+            f'{1e3 * result.force_delay_sigma:.2f} ms',
             f'# gravity in the map: {np.round(result.gravity_map, 4).tolist()} m/s^2',
             '/**:',
             '  ros__parameters:',

@@ -98,8 +98,8 @@ def test_one_pose_far_off_does_not_make_the_error_that_is_printed(tmp_path, caps
     residuals[:, 0] = 1e-4
     residuals[274, 0] = 2.188
     found = CameraImuCalibration(
-        T_BODY_CAMERA, 0.0, 1e-8 * np.eye(7), 0.0, 1e-4, 0.0, np.zeros(3), np.zeros(6), np.zeros(15), np.zeros(15),
-        residuals, len(residuals), 1.0,
+        T_BODY_CAMERA, 0.0, 1e-8 * np.eye(7), 0.0, 1e-4, 0.0, np.zeros(3), np.zeros(6), 0.0, 1e-3,
+        np.zeros(15), np.zeros(15), residuals, len(residuals), 1.0,
     )  # fmt: skip
     monkeypatch.setattr(camera_imu, 'calibrate_rolling_camera_imu', lambda *_: found)
     bag = recording(seconds=1.0).write(tmp_path / 'bag')
