@@ -132,3 +132,20 @@ def test_px4_is_listened_for_on_its_own_topic(monkeypatch):
         node = graph.add(PoseEkfNode, bridge_rate=50.0, px4=True)
         right = {'receivers': (Level.WARNING, '0 listen to /fmu/in/vehicle_visual_odometry')}
         assert found_links(monkeypatch, graph, node, right).items() >= right.items()
+
+
+def test_the_landing_target_of_another_robot_is_not_listened_to(monkeypatch):
+    """That of any robot was taken: a pad that another drone sees passed for the one of the drone that is checked."""
+    with ros_graph() as graph:
+        for kind, name in ((LandingTarget, 'drone1'), (PoseEkfNode, 'drone2')):
+            graph.added(kind(live=False, context=graph.context, namespace=name))
+        right = {'sender': '/drone2/pose_ekf', 'landing': '/drone2/landing_target'}
+        assert found_topics(right, monkeypatch) == right
+
+
+def test_a_remapped_landing_target_is_listened_to(monkeypatch):
+    with ros_graph('-r', 'landing_target:=mavros/landing_target/pose') as graph:
+        for kind in (LandingTarget, PoseEkfNode):
+            graph.add(kind)
+        right = {'landing': '/mavros/landing_target/pose'}
+        assert found_topics(right, monkeypatch) == right

@@ -119,8 +119,8 @@ def _find(node: Node, executor: Any, topic: str, said: dict[str, DiagnosticStatu
     _spin(executor, SAID_S, lambda: False)
     look()
     ours = 'bridge/odometry'
-    topics = _only(found, node.get_namespace()) or Topics(ours, 'imu/data', _LANDING, ours, _FILTER)
-    topics = replace(topics, landing=_landing_topic(node) or topics.landing)
+    own = node.get_namespace()
+    topics = _only(found, own) or Topics(ours, 'imu/data', _landing_topic(node, own), ours, _FILTER)
     return replace(topics, odometry=topic, autopilot=topic) if topic else topics
 
 
@@ -152,13 +152,16 @@ def _topics_of_filter(node: Node, namespace: str, said: dict[str, DiagnosticStat
     # Remapped topics are known by the filter's own words only.
     sent = named.get(BRIDGE_TOPIC) or named.get(ODOMETRY_TOPIC) or (bridge or odometry)[0]
     px4 = [name for name, kinds in published if PX4_KIND in kinds]
-    return Topics(sent, imu[0], f'{base}/{_LANDING}', (px4 or [sent])[0], f'{base}/{_FILTER}')
+    return Topics(sent, imu[0], _landing_topic(node, namespace), (px4 or [sent])[0], f'{base}/{_FILTER}')
 
 
-def _landing_topic(node: Node) -> str:
-    """Remapped topic of the node landing_target; empty if it does not run."""
-    every = (node.get_publisher_names_and_types_by_node(_LANDING, space) for space in _namespaces(node, _LANDING))
-    return next((topic for published in every for topic, kinds in published if _POSE in kinds), '')
+def _landing_topic(node: Node, namespace: str) -> str:
+    """Topic of the landing target of the robot in ``namespace``, remapped or not; the default name without one."""
+    if namespace in _namespaces(node, _LANDING):
+        for topic, kinds in node.get_publisher_names_and_types_by_node(_LANDING, namespace):
+            if _POSE in kinds:
+                return topic
+    return f'{namespace.rstrip("/")}/{_LANDING}'
 
 
 def _namespaces(node: Node, wanted: str) -> list[str]:
