@@ -17,6 +17,7 @@ from thermal_fiducial.files.clock_offset import recent_clock_offset, save_clock_
 from thermal_fiducial.files.restart_file import save_for_restart
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
+from thermal_fiducial.ros.base.restart_memory import RestartMemory
 from thermal_fiducial.ros.filter_node import filter_memory
 from thermal_fiducial.ros.mapper_node import freeze_memory
 
@@ -122,6 +123,23 @@ def test_a_restarted_filter_begins_with_the_offset_of_the_one_before(tmp_path, m
     with ros_graph() as graph:
         graph.add(PoseEkfNode, live=True)
     assert 'started again' not in capfd.readouterr().err
+
+
+@pytest.mark.ros
+def test_robots_whose_names_are_alike_each_have_their_own_file(tmp_path, monkeypatch):
+    """The robots /a/b and /a_b shared one, and began with the clock offset of each other."""
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    # As long as the services of a node allow, 225 characters with its name; they differ in the last one.
+    long = ['n' * 210 + end for end in 'xy']
+    with ros_graph() as graph:
+        names = ['', 'a/b', 'a_b', 'a/b_pose_ekf', 'A/b', *long]
+        nodes = [PoseEkfNode(live=True, context=graph.context, namespace=name) for name in names]
+        paths = [RestartMemory(graph.added(node), active=False).path for node in nodes]
+    assert len(set(paths)) == len(names)
+    for path in paths:
+        save_clock_offset(path, 0.004)
+        # The shortest limit of a file system in use, that of eCryptfs.
+        assert len(f'{path.name}.new') <= 143
 
 
 @pytest.fixture(autouse=True)

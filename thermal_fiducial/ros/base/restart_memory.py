@@ -2,13 +2,12 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-import os
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.robot_folder import robot_folder
+from thermal_fiducial.files.robot_folder import file_name_of, robot_folder
 from thermal_fiducial.ros.base.node import StageNode
 
 
@@ -22,8 +21,8 @@ class RestartMemory:
     """
 
     def __init__(self, node: StageNode[Any], *, active: bool) -> None:
-        name = node.get_fully_qualified_name().strip('/').replace('/', '_')
-        self.path = robot_folder() / f'{name}_{os.environ.get("ROS_DOMAIN_ID", "0")}.json'
+        name = file_name_of(node.get_fully_qualified_name())
+        self.path = robot_folder() / f'{name}_{node.context.get_domain_id()}.json'
         self.active = active
         # That of the last save; the first one never runs.
         self._writer = Thread()
