@@ -288,18 +288,20 @@ def _history(args: argparse.Namespace) -> int:
     for entry in map_history.entries(args.map):
         what = entry.problem or f'{entry.content}, before: {entry.action}'
         print(f'{entry.number:6d}  {what}')
+    # Before the map itself, which may be why one looks here: it cannot be read.
+    next_up = map_history.autosaved(args.map)
+    for entry in map_history.autosaves(args.map):
+        taken_up = ': map undo takes it up' if entry == next_up else ''
+        print(f'autosaved  {entry.content} in {entry.path}{taken_up}')
     current = read_document(str(args.map))
     print(f'   now  revision {current.revision}, {number_of(len(current.markers), "marker")}')
-    copy = map_history.autosaved(args.map)
-    if copy is not None:
-        print(f'autosaved  {copy.content}: map undo takes it up')
     return 0
 
 
 def _undo(args: argparse.Namespace) -> int:
     copy = map_history.autosaved(args.map)
     if copy is not None:
-        map_history.take_up_autosave(args.map)
+        map_history.take_up_autosave(args.map, copy.path)
         print(f'{args.map}: the autosaved map is taken up; {copy.content}')
         return 0
     entry = map_history.undo(args.map)

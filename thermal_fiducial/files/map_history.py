@@ -5,6 +5,7 @@ Every change of a map file goes through this module: under a lock, and only if t
 
 from contextlib import suppress
 from dataclasses import dataclass
+import glob
 import hashlib
 from pathlib import Path
 import re
@@ -47,8 +48,8 @@ class MapVersion:
 
     @property
     def content(self) -> str:
-        """Its revision and size in words."""
-        return f'revision {self.revision}, {number_of(self.markers, "marker")}'
+        """Its revision and size in words, or why it cannot be read."""
+        return self.problem or f'revision {self.revision}, {number_of(self.markers, "marker")}'
 
 
 def history_folder(path: Path) -> Path:
@@ -56,9 +57,9 @@ def history_folder(path: Path) -> Path:
     return _beside(path, 'history')
 
 
-def autosave_file(path: Path) -> Path:
-    """Autosave file of the map at ``path``."""
-    return _beside(path, 'autosave')
+def autosave_file(path: Path, robot: str = '') -> Path:
+    """Autosave file of the map at ``path``, into which the mapper of a ``robot`` maps; empty: without a namespace."""
+    return _beside(path, f'autosave.{robot}' if robot else 'autosave')
 
 
 def _beside(path: Path, ending: str) -> Path:
@@ -156,11 +157,10 @@ def keep(path: Path, text: str, action: str) -> None:
 
 def entries(path: Path) -> list[MapVersion]:
     """Earlier versions of the map at ``path``, oldest first; unreadable ones with their ``problem``."""
-    return [_entry(file) for file in _files(path)]
+    return [_entry(file, int(file.stem)) for file in _files(path)]
 
 
-def _entry(file: Path) -> MapVersion:
-    number = int(file.stem)
+def _entry(file: Path, number: int) -> MapVersion:
     try:
         text = read_text(file)
         document = parse_document(str(file), text)
@@ -205,27 +205,37 @@ def undo(path: Path) -> MapVersion:
         return last
 
 
+def autosaves(path: Path) -> list[MapVersion]:
+    """What mappers that run, or ended without saving, have autosaved since the map was written; oldest first.
+
+    Unreadable ones are among them, with their ``problem``.
+    """
+    found = []
+    with suppress(OSError, InputError):
+        own = autosave_file(path)
+        since_ns = path.stat().st_mtime_ns if path.exists() else 0
+        for file in (own, *own.parent.glob(f'{glob.escape(own.name)}.*')):
+            # A mapper that runs may save, and delete it.
+            with suppress(OSError):
+                written_ns = file.stat().st_mtime_ns
+                if written_ns >= since_ns:
+                    found.append((written_ns, file))
+    return [_entry(file, 0) for _, file in sorted(found)]
+
+
 def autosaved(path: Path) -> MapVersion | None:
-    """The autosave of a mapper that ended without saving, if it is newer than the map."""
-    try:
-        file = autosave_file(path)
-        if path.exists() and file.stat().st_mtime_ns < path.stat().st_mtime_ns:
-            return None
-        document = parse_document(str(file), read_text(file))
-    except (OSError, InputError):
-        return None
-    return MapVersion(0, file, TAKE_UP, document.revision, len(document.markers))
+    """The newest of the :func:`autosaves` that can be read."""
+    return next((entry for entry in reversed(autosaves(path)) if not entry.problem), None)
 
 
-def take_up_autosave(path: Path) -> None:
-    """Replace the map by the autosaved one; the present map goes into the history.
+def take_up_autosave(path: Path, file: Path) -> None:
+    """Replace the map by the autosaved one in ``file``; the present map goes into the history.
 
     Raises
     ------
     InputError
-        There is none, or it cannot be read or written.
+        It cannot be read, or the map cannot be written.
     """
-    file = autosave_file(path)
     with locked(path):
         text = read_text(file)
         parse_document(str(file), text)
@@ -234,8 +244,8 @@ def take_up_autosave(path: Path) -> None:
             file.unlink()
 
 
-def put_autosave_aside(path: Path) -> None:
-    """Move an unused autosaved map into the history; only under :func:`locked`.
+def put_autosave_aside(path: Path, file: Path) -> None:
+    """Move an unused autosaved map in ``file`` into the history; only under :func:`locked`.
 
     Raises
     ------
@@ -244,7 +254,6 @@ def put_autosave_aside(path: Path) -> None:
     InputError
         The autosave is too large for a map.
     """
-    file = autosave_file(path)
     if file.is_file():
         keep(path, _whatever(file), PUT_ASIDE)
         file.unlink(missing_ok=True)

@@ -12,6 +12,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import map_history
 from thermal_fiducial.files.atomic import locked, write_atomically
+from thermal_fiducial.files.map_history import MapVersion
 from thermal_fiducial.files.marker_map import dump_map, load_map
 from thermal_fiducial.files.robot_folder import robot_folder
 from thermal_fiducial.files.writing import into
@@ -29,14 +30,22 @@ class MapKeeper:
     marker_size : side of markers whose entry has none [m]
     size_overrides : marker ID to side [m], instead of ``marker_size``
     flown : the map was made in flight and cannot be repeated: if its folder is not writable, save it elsewhere
+    robot : whose mapper it is, in the name of its autosave; empty: of a robot without a namespace
     """
 
     def __init__(
-        self, path: Path | None, marker_size: float, size_overrides: Mapping[int, float], *, flown: bool = True
+        self,
+        path: Path | None,
+        marker_size: float,
+        size_overrides: Mapping[int, float],
+        *,
+        flown: bool = True,
+        robot: str = '',
     ) -> None:
         self._path = path
         self._sizes = marker_size, size_overrides
         self._flown = flown
+        self._robot = robot
         # Digests of the file that the map was made from, and of the one read last. 'nothing' matches no file: an unread
         # one is not overwritten.
         self._read = self._at_hand = 'nothing'
@@ -62,6 +71,10 @@ class MapKeeper:
             raise InputError('parameter map_file is empty: there is no map on disk')
         return self._path
 
+    @property
+    def _autosave_file(self) -> Path:
+        return map_history.autosave_file(self.path, self._robot)
+
     def read(self) -> MarkerMap:
         """The map in the file, which :meth:`take` makes the one at hand.
 
@@ -81,21 +94,35 @@ class MapKeeper:
         self._read, self.unsaved = self._at_hand, False
 
     def recover(self, autosave_period: float) -> tuple[MarkerMap | None, str]:
-        """The autosaved map of a mapper that has just crashed (or None), and a message about an autosave.
+        """The autosaved map of this mapper if it has just crashed (or None), and a message about autosaves.
 
         Parameters
         ----------
         autosave_period : of this mapper [s]; 0: no autosave is resumed
         """
-        entry = None if self._path is None else map_history.autosaved(self._path)
-        if entry is None:
+        if self._path is None:
             return None, ''
-        found = f'{entry.path} ({entry.content})'
-        age_s = time.time() - entry.path.stat().st_mtime
-        if not 0.0 <= age_s <= RESTART_PERIODS * autosave_period:
-            return None, f'{found} was never saved: thermal-fiducial map undo {quote(str(self._path))} takes it up'
+        marker_map, notes = None, []
+        for entry in map_history.autosaves(self._path):
+            if entry.path == self._autosave_file:
+                marker_map, note = self._resumed(entry, autosave_period)
+            else:
+                note = f'{entry.path} ({entry.content}) is of the mapper of another robot, which runs or crashed'
+            notes.append(note)
+        return marker_map, '; '.join(notes)
+
+    def _resumed(self, entry: MapVersion, autosave_period: float) -> tuple[MarkerMap | None, str]:
+        """The own autosave if it is to be resumed, and a message about it."""
+        found, file = f'{entry.path} ({entry.content})', quote(str(self._path))
+        if entry.problem:
+            return None, f'{entry.problem}; the next autosave moves it to {map_history.history_folder(self.path)}'
         try:
+            age_s = time.time() - entry.path.stat().st_mtime
+            if not 0.0 <= age_s <= RESTART_PERIODS * autosave_period:
+                return None, f'{found} was never saved: thermal-fiducial map undo {file} takes it up'
             recovered = load_map(entry.path, *self._sizes)
+        except OSError as error:
+            return None, f'{entry.path}: {error.strerror}'
         except InputError as error:
             return None, str(error)
         # If this mapper crashes before its own first autosave, this one is still that of the mapper just before.
@@ -127,7 +154,11 @@ class MapKeeper:
             self._read = map_history.save_with_history(self.path, marker_map, 'save', self._read)
         except InputError as error:
             self.obstacle = str(error)
-            return self._save_elsewhere(marker_map, 'new')
+            path = self._save_elsewhere(marker_map, 'new')
+            # Else it was resumed, or offered for undo, instead of what another program wrote to the map.
+            if self._own_autosave and path.parent == self.path.parent:
+                self._retire_autosave()
+            return path
         self.fault = ''
         self._retire_autosave()
         return self.path
@@ -182,12 +213,12 @@ class MapKeeper:
             self._writer.start()
 
     def _autosave(self, marker_map: MarkerMap) -> None:
-        file = map_history.autosave_file(self.path)
+        file = self._autosave_file
         try:
             text = dump_map(marker_map)
             with locked(self.path), into(file):
                 if not self._own_autosave:
-                    map_history.put_autosave_aside(self.path)
+                    map_history.put_autosave_aside(self.path, file)
                 write_atomically(file, text)
         except InputError as error:
             self.fault = f'no autosave: {error}'
@@ -198,9 +229,9 @@ class MapKeeper:
         """After a save delete the own autosave; move one of an earlier mapper into the history."""
         with suppress(OSError, InputError), locked(self.path):
             if self._own_autosave:
-                map_history.autosave_file(self.path).unlink(missing_ok=True)
+                self._autosave_file.unlink(missing_ok=True)
             else:
-                map_history.put_autosave_aside(self.path)
+                map_history.put_autosave_aside(self.path, self._autosave_file)
         self._own_autosave = False
 
     def finish(self) -> None:

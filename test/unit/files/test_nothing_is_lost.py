@@ -29,8 +29,8 @@ def path(tmp_path):
     return folder / 'hall.yaml'
 
 
-def keeper_of(path):
-    keeper = MapKeeper(path, 0.3, {})
+def keeper_of(path, robot=''):
+    keeper = MapKeeper(path, 0.3, {}, robot=robot)
     keeper.read()
     keeper.take()
     keeper.unsaved = True
@@ -153,6 +153,57 @@ def test_an_unused_autosave_is_kept_beside_a_newer_one(path):
     assert whole(map_history.autosave_file(path)) == 3
     (entry,) = map_history.entries(path)
     assert (entry.action, entry.revision) == (map_history.PUT_ASIDE, 2)
+
+
+def test_robots_that_map_into_one_file_keep_each_others_autosave(path, capsys):
+    """They shared it: the first to end deleted it, and one that started resumed the map of another."""
+    first, second = keeper_of(path), keeper_of(path, 'drone2')
+    autosaved(first, grown(2))
+    autosaved(second, grown(3))
+    mine, other = (map_history.autosave_file(path, robot) for robot in ('', 'drone2'))
+    third, note = MapKeeper(path, 0.3, {}, robot='drone3').recover(AUTOSAVE_S)
+    assert third is None
+    assert f'{mine} (revision 2, 60 markers) is of the mapper of another robot' in note
+    assert f'{other} (revision 3, 60 markers) is of the mapper of another robot' in note
+    assert main(['map', 'history', str(path)]) == 0
+    assert f'revision 3, 60 markers in {other}: map undo takes it up' in capsys.readouterr().out
+    # The first one lands, the second one crashes at once: before its own next autosave, which is older than the map.
+    assert first.save(grown(4)) == path
+    assert (mine.exists(), whole(other)) == (False, 3)
+    autosaved(second, grown(5))
+    again, note = MapKeeper(path, 0.3, {}, robot='drone2').recover(AUTOSAVE_S)
+    assert again.revision == 5, note
+
+
+@pytest.mark.parametrize('future', ['map', 'autosave', 'both'])
+def test_files_of_a_later_release_are_named_and_stay(path, capsys, future):
+    """An autosave of another schema was passed over in silence; the history of such a map named none."""
+    autosaved(keeper_of(path), grown(2))
+    copy = map_history.autosave_file(path)
+    for file in {'map': [path], 'autosave': [copy], 'both': [path, copy]}[future]:
+        stamps = file.stat().st_atime_ns, file.stat().st_mtime_ns
+        file.write_text(file.read_text().replace('version: 1', 'version: 2'))
+        os.utime(file, ns=stamps)
+    recovered, note = MapKeeper(path, 0.3, {}).recover(AUTOSAVE_S)
+    assert (recovered is None) == (future != 'map')
+    assert str(copy) in note
+    assert main(['map', 'history', str(path)]) == (0 if future == 'autosave' else 2)
+    words = 'revision 2, 60 markers in' if future == 'map' else f'{copy}: line 2: version: schema 2 is unknown'
+    assert f'autosaved  {words}' in capsys.readouterr().out
+    if future != 'map':
+        before = copy.read_text()
+        autosaved(keeper_of(path) if future == 'autosave' else MapKeeper(path, 0.3, {}), grown(3))
+        (file,) = map_history.history_folder(path).iterdir()
+        assert file.read_text().endswith(before)
+
+
+def test_a_map_that_was_saved_beside_its_file_leaves_no_autosave(path):
+    """The next mapper resumed it, with the words that the last one had not ended in order, over what was edited."""
+    keeper = keeper_of(path)
+    assert main(['map', 'move', str(path), '3', '--position', '1', '2', '3']) == 0
+    autosaved(keeper, grown(2))
+    assert keeper.save(grown(2)) == path.with_name('hall.new.yaml')
+    assert MapKeeper(path, 0.3, {}).recover(AUTOSAVE_S) == (None, '')
 
 
 def test_an_unchanged_map_is_not_autosaved(path):

@@ -4,10 +4,12 @@ from dataclasses import replace
 import errno
 import multiprocessing
 import os
+from pathlib import Path
 import threading
 import time
 
 import pytest
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
 from support.waiting import PATIENCE_S
@@ -144,6 +146,18 @@ def test_a_load_holds_no_frame_up_for_another_programs_lock(graph, map_file, mon
         assert time.monotonic() - began < 0.5 * PATIENCE_S
     assert ask(graph, 'load')[0]
     assert not autosave_file(map_file).exists()
+
+
+def test_the_autosave_of_a_robot_with_a_namespace_is_its_own(graph, map_file, tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    parameters = [Parameter('map_file', value=str(map_file)), Parameter('autosave_period', value=0.05)]
+    for space, ending in (('', ''), ('fleet/drone1', '.fleet.drone1')):
+        node = Flown(live=True, context=graph.context, namespace=space, parameter_overrides=parameters)
+        graph.added(node).find(9)
+        graph.spin_until(Path(f'{map_file}.autosave{ending}').exists)
+        node.finish()
+        node.close()
+    assert not list(map_file.parent.glob(f'{map_file.name}.autosave*'))
 
 
 @pytest.mark.parametrize('name', ['load', 'undo'])

@@ -19,6 +19,7 @@ from thermal_fiducial.files.dictionary import bring_beside, other_patterns
 from thermal_fiducial.files.map_keeper import MapKeeper
 from thermal_fiducial.files.marker_map import other_frame, other_sides
 from thermal_fiducial.files.reading import is_there
+from thermal_fiducial.files.robot_folder import file_name_of
 from thermal_fiducial.ros.base.node import Made, StageNode
 from thermal_fiducial.ros.mapper_node.freeze_memory import FreezeMemory
 from thermal_fiducial.ros.mapper_node.map_refinement import MapRefinement
@@ -48,7 +49,8 @@ class MapServices:
         self._publish_jump = publish_jump
         file = Path(config.map_file) if config.map_file else None
         sizes = size_overrides(config.marker_size_overrides)
-        self._keeper = MapKeeper(file, config.marker_size, sizes, flown=node.live)
+        robot = file_name_of(node.get_namespace())
+        self._keeper = MapKeeper(file, config.marker_size, sizes, flown=node.live, robot=robot)
         self._disk = ThreadPoolExecutor(1)
         self._other_dictionary = ''
         #: the fault of a map file that could not be read at the start
