@@ -181,6 +181,9 @@ def _pinhole(entry: Value) -> FloatArray:
 def _lens(entry: Value, width: int, height: int, K: FloatArray, model: str, coefficients: str) -> Camera:
     """Camera of ``entry``; ``model`` and ``coefficients`` are the names of its fields for the distortion."""
     fields = entry.mapping()
+    if model in fields and coefficients not in fields:
+        # Under another file's name for them the lens would pass for one without distortion.
+        raise entry.error(f'a {model} without {coefficients}; a lens without distortion has []')
     name = fields[model].text() if model in fields else 'plumb_bob'
     D = fields[coefficients].items() if coefficients in fields else []
     distortion = np.array([value.number() for value in D])

@@ -231,6 +231,7 @@ def corrupt(path, change):
         ('rig.yaml', lambda text: text.replace('cam1', 'cam0'), ('rig.yaml', 'cam1', 'cam0')),
         ('rig.yaml', lambda text: text.replace('width: 640', 'width: wide'), ('rig.yaml: line', 'cam1: width', 'wide')),
         ('rig.yaml', lambda text: text.replace('radtan', 'cubic'), ('rig.yaml', 'cubic')),
+        ('rig.yaml', lambda text: text.replace('D:', 'distortion_coefficients:'), ('rig.yaml', 'model without D')),
         ('rig.yaml', lambda text: text.replace('marker_size: 0.3', ''), ('--marker-size',)),
         ('rig.yaml', lambda text: text.replace('DICT_4X4_50', '/dev/zero'), ('/dev/zero', 'dictionary')),
         ('imu.csv', lambda text: text.replace('1700000000', '9000000000'), ('imu.csv line 2', 'stamp')),
