@@ -47,12 +47,15 @@ def load_tum(path: str | Path) -> tuple[IntArray, FloatArray, FloatArray]:
     Raises
     ------
     InputError
-        Unreadable, empty, a line other than eight finite numbers, a zero quaternion, or decreasing stamps.
+        Unreadable, empty, a line other than eight finite numbers, a zero quaternion, decreasing stamps, or a heading
+        that has the quaternion in another order.
     """
     numbers: list[int] = []
     rows: list[tuple[int, list[float]]] = []
     for number, line in text_lines(path, _LIMIT_BYTES):
-        if line[0] != '#':
+        if line[0] == '#':
+            _require_w_last(path, number, line)
+        else:
             numbers.append(number)
             rows.append(_row(path, number, line))
     if not rows:
@@ -64,6 +67,13 @@ def load_tum(path: str | Path) -> tuple[IntArray, FloatArray, FloatArray]:
     values = np.array([row for _, row in rows])
     quaternions = values[:, 3:]
     return stamps, values[:, :3], quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+
+
+def _require_w_last(path: str | Path, number: int, comment: str) -> None:
+    """Raise InputError for a heading of columns that has qw before qx: values are known by their places."""
+    names = comment.lstrip('# ').replace(',', ' ').split()
+    if {'qw', 'qx'} <= set(names) and names.index('qw') < names.index('qx'):
+        raise InputError(f'{path} line {number}: qw before qx; a pose is timestamp tx ty tz qx qy qz qw')
 
 
 def _row(path: str | Path, number: int, line: str) -> tuple[int, list[float]]:

@@ -24,7 +24,7 @@ def test_line():
 
 
 def test_reads_comments_commas_exponents_and_normalises(tmp_path):
-    (tmp_path / 'a.tum').write_text('# stamp\n\n1.5e3, 1,2,3, 0,0,0,2\n1501 1 2 3 0 0 2 0\n')
+    (tmp_path / 'a.tum').write_text('# stamp x y z qx qy qz qw\n\n1.5e3, 1,2,3, 0,0,0,2\n1501 1 2 3 0 0 2 0\n')
     stamps, _, q = load_tum(tmp_path / 'a.tum')
     assert stamps.tolist() == [1_500_000_000_000, 1_501_000_000_000]
     np.testing.assert_array_equal(q, [[0, 0, 0, 1], [0, 0, 1, 0]])
@@ -42,6 +42,7 @@ def test_reads_comments_commas_exponents_and_normalises(tmp_path):
         ('inf 0 0 0 0 0 0 1\n', 'line 1'),
         ('nan 0 0 0 0 0 0 1\n', 'line 1'),
         ('1 0 0 0 0 0 0 0\n', 'no length'),
+        ('# timestamp tx ty tz qw qx qy qz\n1 0 0 0 1 0 0 0\n', 'line 1: qw before qx'),
         ('# c\n2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n', 'line 3: the stamp goes back'),
     ],
 )
