@@ -109,6 +109,12 @@ class BridgeRecorder:
         )
 
 
+def _namespace(odometry: str) -> str:
+    """Namespace of the robot of an odometry, with a slash behind it; empty: none, or a topic of another name."""
+    known = (name for name in ODOMETRY_TOPICS if f'/{odometry}'.endswith(f'/{name}'))
+    return odometry.removesuffix(next(known, odometry))
+
+
 def read_bridge(path: Path, topic: str = '', imu_bag: Path | None = None) -> BridgeRecord:
     """Record of a bag, or of the ``output`` of a run folder.
 
@@ -127,15 +133,17 @@ def read_bridge(path: Path, topic: str = '', imu_bag: Path | None = None) -> Bri
 
     recorder = BridgeRecorder()
     with BagReader(path / 'output' if (path / 'output').is_dir() else path) as bag:
-        wanted = [name for name in ([topic] if topic else ODOMETRY_TOPICS) if name in bag.topics]
+        wanted = [name for name in ([topic.strip('/')] if topic else ODOMETRY_TOPICS) if name in bag.topics]
         if not wanted:
             raise InputError(f'{path}: no topic {topic or " or ".join(ODOMETRY_TOPICS)}')
         bag.require({wanted[0]: 'nav_msgs/msg/Odometry'})
-        landing = LANDING_TOPIC if bag.topics.get(LANDING_TOPIC) == 'geometry_msgs/msg/PoseStamped' else wanted[0]
+        landing = f'{_namespace(wanted[0])}{LANDING_TOPIC}'
+        if bag.topics.get(landing) != 'geometry_msgs/msg/PoseStamped':
+            landing = ''
         for message in bag.messages([wanted[0], IMU_TOPIC, landing]):
             if message.topic == IMU_TOPIC:
                 recorder.imu(message.message)
-            elif message.topic == LANDING_TOPIC:
+            elif message.topic == landing:
                 recorder.landing_target(message.message)
             else:
                 recorder.odometry(message.message, message.stamp_ns)

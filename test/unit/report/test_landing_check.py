@@ -84,7 +84,9 @@ def test_each_mistake_is_named():
     assert levels(given, stamps_ns=given.landing.stamps_ns + 10**12)['landing target'] is Level.UNTESTED
 
 
-def test_the_command_reads_it_from_a_bag(tmp_path, capsys):
+@pytest.mark.parametrize('robot', ['', '/drone1/'])
+def test_the_command_reads_it_from_a_bag(tmp_path, capsys, robot):
+    """That of a robot with a namespace was not looked for, and topics as ROS writes them were not found."""
     types = get_typestore(Stores.ROS2_JAZZY).types
     given = record()
 
@@ -113,11 +115,11 @@ def test_the_command_reads_it_from_a_bag(tmp_path, capsys):
                 twist=types['geometry_msgs/msg/TwistWithCovariance'](twist=still, covariance=np.eye(6).ravel()),
             )
             target = pose(given.landing.positions[k], (0.0, 0.0, 0.0, 1.0))
-            bag.write('bridge/odometry', int(stamp), odometry)
+            bag.write(f'{robot}bridge/odometry', int(stamp), odometry)
             bag.write(
-                'landing_target',
+                f'{robot}landing_target',
                 int(stamp),
                 types['geometry_msgs/msg/PoseStamped'](header=header(stamp, 'base_link_rfu'), pose=target),
             )
-    main(['check-bridge', str(tmp_path / 'bag')])
+    main(['check-bridge', str(tmp_path / 'bag'), *(['--topic', f'{robot}bridge/odometry'] if robot else [])])
     assert 'ok  landing target: in the body (ArduPilot, BODY_FRD), 2.' in capsys.readouterr().out
