@@ -273,7 +273,7 @@ def test_tf_stands_before_a_urdf_and_does_not_move_the_camera_in_flight():
     robot.taken['robot_description'](String(data=URDF))
     robot.taken['/tf_static'](static('base_link', CAMERA, transform(np.eye(3), [0.7, 0.0, 0.0])))
     assert moved == [1, 2]
-    assert 'ignored until' in robot.events['camera']
+    assert 'ignored until' in robot.events['frames']
     assert len(robot.said) == 2
 
 
@@ -335,7 +335,22 @@ def test_tf_does_not_move_an_imu_with_its_camera_in_flight():
     np.testing.assert_allclose(frames.T_imu_base, inverse(T_base_imu), atol=1e-12)
     robot.taken['/tf_static'](static('base_link', 'imu_link', transform(np.eye(3), [0.0, 0.3, 0.0])))
     np.testing.assert_allclose(frames.T_imu_base, inverse(T_base_imu), atol=1e-12)
-    assert robot.events['camera'] == '/tf_static has moved the IMU on the robot: ignored until the node is restarted'
+    assert '/tf_static has moved the IMU on the robot: ignored until' in robot.events['frames']
+    # The diagnostics say so until it is back.
+    assert frames.doubt == robot.events['frames']
+    robot.taken['/tf_static'](static('base_link', 'imu_link', T_base_imu))
+    assert frames.doubt == ''
+
+
+@pytest.mark.usefixtures('tf2_msgs')
+def test_two_robots_that_share_the_names_of_their_frames_are_in_the_diagnostics():
+    """Which camera was taken for one's own was left to chance, and only the console said that there are two."""
+    robot = Robot()
+    frames = RobotFrames(robot)
+    for x in (0.1, 0.5):
+        robot.taken['/tf_static'](static('base_link', CAMERA, transform(np.eye(3), [x, 0.0, 0.0])))
+    assert 'two robots need prefix_frames' in frames.doubt
+    np.testing.assert_allclose(in_force(robot)[:3, 3], [0.1, 0.0, 0.0], atol=1e-12)
 
 
 def test_a_state_in_another_frame_of_the_body():

@@ -47,6 +47,8 @@ class RobotFrames:
         self._node, self._on_moved = node, on_moved
         self._trees = {_URDF: FrameTree(), _TF: FrameTree()}
         self._imu_frame = ''
+        # That the source has another pose now than the one in use; empty if it has not.
+        self._moved = ''
         #: source of the camera's pose
         self.source = _PARAMETERS
         #: whether the wait for TF and URDF is over
@@ -78,7 +80,9 @@ class RobotFrames:
 
     @property
     def doubt(self) -> str:
-        """That nothing says where the camera is, or that what says it does not know the IMU's frame; else empty."""
+        """That nothing says where the camera is, or two poses, or that the IMU's frame is unknown there; else empty."""
+        if self._moved:
+            return self._moved
         frame, base = self._imu_frame, self._node.config.base_frame
         if self.parameters_hold:
             return doubt_of_place('camera_position', self._node.config.camera_position)
@@ -135,9 +139,10 @@ class RobotFrames:
             begins = source != self.source or (self.T_imu_base is None and T_imu_base is not None)
             if not begins and (moved or not _same(T_imu_base, self.T_imu_base)):
                 what = 'camera' if moved else 'IMU'
-                text = f'{source} has moved the {what} on the robot: ignored until the node is restarted'
-                self._node.console.event('camera', text)
-                return
+                ignored = 'ignored until the node is restarted; two robots need prefix_frames'
+                self._moved = f'{source} has moved the {what} on the robot: {ignored}'
+                break
+            self._moved = ''
             self._take(source, T_body_camera, T_imu_base, moved=moved)
             break
         self._name_doubt()
