@@ -291,8 +291,8 @@ def _history(args: argparse.Namespace) -> int:
     # Before the map itself, which may be why one looks here: it cannot be read.
     next_up = map_history.autosaved(args.map)
     for entry in map_history.autosaves(args.map):
-        taken_up = ': map undo takes it up' if entry == next_up else ''
-        print(f'autosaved  {entry.content} in {entry.path}{taken_up}')
+        fate = ': map undo takes it up' if entry == next_up else ', before the map was written' * entry.outdated
+        print(f'autosaved  {entry.content} in {entry.path}{fate}')
     current = read_document(str(args.map))
     print(f'   now  revision {current.revision}, {number_of(len(current.markers), "marker")}')
     return 0

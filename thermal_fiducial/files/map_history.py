@@ -45,6 +45,8 @@ class MapVersion:
     markers: int = 0
     #: why it cannot be read; else empty
     problem: str = ''
+    #: of an autosave: whether the map has been written since
+    outdated: bool = False
 
     @property
     def content(self) -> str:
@@ -160,13 +162,13 @@ def entries(path: Path) -> list[MapVersion]:
     return [_entry(file, int(file.stem)) for file in _files(path)]
 
 
-def _entry(file: Path, number: int) -> MapVersion:
+def _entry(file: Path, number: int, *, outdated: bool = False) -> MapVersion:
     try:
         text = read_text(file)
         document = parse_document(str(file), text)
     except InputError as error:
-        return MapVersion(number, file, '', problem=str(error))
-    return MapVersion(number, file, _action(text), document.revision, len(document.markers))
+        return MapVersion(number, file, '', problem=str(error), outdated=outdated)
+    return MapVersion(number, file, _action(text), document.revision, len(document.markers), outdated=outdated)
 
 
 def _action(text: str) -> str:
@@ -206,26 +208,25 @@ def undo(path: Path) -> MapVersion:
 
 
 def autosaves(path: Path) -> list[MapVersion]:
-    """What mappers that run, or ended without saving, have autosaved since the map was written; oldest first.
+    """What mappers that run, or ended without saving, have autosaved; oldest first.
 
     Unreadable ones are among them, with their ``problem``.
     """
-    found = []
+    found, since_ns = [], 0
     with suppress(OSError, InputError):
         own = autosave_file(path)
         since_ns = path.stat().st_mtime_ns if path.exists() else 0
         for file in (own, *own.parent.glob(f'{glob.escape(own.name)}.*')):
             # A mapper that runs may save, and delete it.
             with suppress(OSError):
-                written_ns = file.stat().st_mtime_ns
-                if written_ns >= since_ns:
-                    found.append((written_ns, file))
-    return [_entry(file, 0) for _, file in sorted(found)]
+                found.append((file.stat().st_mtime_ns, file))
+    return [_entry(file, 0, outdated=written_ns < since_ns) for written_ns, file in sorted(found)]
 
 
 def autosaved(path: Path) -> MapVersion | None:
-    """The newest of the :func:`autosaves` that can be read."""
-    return next((entry for entry in reversed(autosaves(path)) if not entry.problem), None)
+    """The newest of the :func:`autosaves` that can be read, if the map has not been written since."""
+    usable = (entry for entry in reversed(autosaves(path)) if not (entry.problem or entry.outdated))
+    return next(usable, None)
 
 
 def take_up_autosave(path: Path, file: Path) -> None:

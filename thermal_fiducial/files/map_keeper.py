@@ -106,6 +106,8 @@ class MapKeeper:
         for entry in map_history.autosaves(self._path):
             if entry.path == self._autosave_file:
                 marker_map, note = self._resumed(entry, autosave_period)
+            elif entry.outdated:
+                continue
             else:
                 note = f'{entry.path} ({entry.content}) is of the mapper of another robot, which runs or crashed'
             notes.append(note)
@@ -114,8 +116,9 @@ class MapKeeper:
     def _resumed(self, entry: MapVersion, autosave_period: float) -> tuple[MarkerMap | None, str]:
         """The own autosave if it is to be resumed, and a message about it."""
         found, file = f'{entry.path} ({entry.content})', quote(str(self._path))
-        if entry.problem:
-            return None, f'{entry.problem}; the next autosave moves it to {map_history.history_folder(self.path)}'
+        if entry.problem or entry.outdated:
+            why = entry.problem or f'{found} was never saved, but the map has been written since'
+            return None, f'{why}; the next autosave moves it to {map_history.history_folder(self.path)}'
         try:
             age_s = time.time() - entry.path.stat().st_mtime
             if not 0.0 <= age_s <= RESTART_PERIODS * autosave_period:

@@ -167,9 +167,14 @@ def test_robots_that_map_into_one_file_keep_each_others_autosave(path, capsys):
     assert f'{other} (revision 3, 60 markers) is of the mapper of another robot' in note
     assert main(['map', 'history', str(path)]) == 0
     assert f'revision 3, 60 markers in {other}: map undo takes it up' in capsys.readouterr().out
-    # The first one lands, the second one crashes at once: before its own next autosave, which is older than the map.
+    # The first one lands; the second one crashes before its next autosave, and after it.
     assert first.save(grown(4)) == path
     assert (mine.exists(), whole(other)) == (False, 3)
+    again, note = MapKeeper(path, 0.3, {}, robot='drone2').recover(AUTOSAVE_S)
+    assert again is None
+    assert f'{other} (revision 3, 60 markers) was never saved, but the map has been written since' in note
+    assert main(['map', 'history', str(path)]) == 0
+    assert f'revision 3, 60 markers in {other}, before the map was written' in capsys.readouterr().out
     autosaved(second, grown(5))
     again, note = MapKeeper(path, 0.3, {}, robot='drone2').recover(AUTOSAVE_S)
     assert again.revision == 5, note
