@@ -269,6 +269,9 @@ def _survey(path: Path) -> dict[int, FloatArray]:
     surveyed: dict[int, FloatArray] = {}
     for number, row in csv_rows(path):
         if row[0].lower() in ('id', '') or row[0].startswith('#'):
+            names = [cell.lower() for cell in row]
+            if {'x', 'y', 'z'} <= set(names) and names[1:4] != ['x', 'y', 'z']:
+                raise InputError(f'{path}: line {number}: columns {", ".join(row)}; they are id, x, y, z')
             continue
         try:
             if not re.fullmatch(r'[0-9]{1,9}', row[0]):

@@ -238,6 +238,9 @@ def test_anchor_moves_the_map_onto_a_survey(path, poses):
         assert anchored.markers[i].fixed == (i in (0, 3, 5))
     survey.write_text('0,1,2,3\n1,2,3\n')
     assert run('anchor', path, survey) == 2
+    # Turned about a diagonal they would fit as well.
+    survey.write_text('ID,Z,X,Y\n' + '\n'.join(lines) + '\n')
+    assert run('anchor', path, survey) == 2
 
 
 def test_anchor_says_what_the_alignment_leaves_open(path, poses, capsys):
