@@ -295,7 +295,7 @@ def _history(args: argparse.Namespace) -> int:
     next_up = map_history.autosaved(args.map)
     for entry in map_history.autosaves(args.map):
         fate = ': map undo takes it up' if entry == next_up else ', before the map was written' * entry.outdated
-        print(f'autosaved  {entry.content} in {entry.path}{fate}')
+        print(f'autosaved  {entry.problem or f"{entry.content} in {entry.path}"}{fate}')
     current = read_document(str(args.map))
     print(f'   now  revision {current.revision}, {number_of(len(current.markers), "marker")}')
     return 0

@@ -25,6 +25,7 @@ KEPT = 50
 TAKE_UP = 'take up the autosaved map'
 PUT_ASIDE = 'an autosaved map that was never taken up'
 _MARK = '# before: '
+_ORIGIN = '# from the map: '
 _NAME = re.compile(r'[0-9]{1,9}\.yaml')
 
 
@@ -45,7 +46,7 @@ class MapVersion:
     markers: int = 0
     #: why it cannot be read; else empty
     problem: str = ''
-    #: of an autosave: whether the map has been written since
+    #: of an autosave: whether another map has been written since
     outdated: bool = False
 
     @property
@@ -162,12 +163,15 @@ def entries(path: Path) -> list[MapVersion]:
     return [_entry(file, int(file.stem)) for file in _files(path)]
 
 
-def _entry(file: Path, number: int, *, outdated: bool = False) -> MapVersion:
+def _entry(file: Path, number: int, later: str = '') -> MapVersion:
+    """The version in a file; ``later``: :func:`digest` of a map that is said to have been written after it."""
     try:
         text = read_text(file)
         document = parse_document(str(file), text)
     except InputError as error:
-        return MapVersion(number, file, '', problem=str(error), outdated=outdated)
+        return MapVersion(number, file, '', problem=str(error), outdated=bool(later))
+    # Where a clock begins anew with each flight, that of the file's own origin may seem to be later.
+    outdated = bool(later) and not text.startswith(f'{_ORIGIN}{later}\n')
     return MapVersion(number, file, _action(text), document.revision, len(document.markers), outdated=outdated)
 
 
@@ -212,7 +216,7 @@ def autosaves(path: Path) -> list[MapVersion]:
 
     Unreadable ones are among them, with their ``problem``.
     """
-    found, since_ns = [], 0
+    found, since_ns, present = [], 0, digest(path)
     with suppress(OSError, InputError):
         own = autosave_file(path)
         since_ns = path.stat().st_mtime_ns if path.exists() else 0
@@ -220,11 +224,20 @@ def autosaves(path: Path) -> list[MapVersion]:
             # A mapper that runs may save, and delete it.
             with suppress(OSError):
                 found.append((file.stat().st_mtime_ns, file))
-    return [_entry(file, 0, outdated=written_ns < since_ns) for written_ns, file in sorted(found)]
+    return [_entry(file, 0, present if written_ns < since_ns else '') for written_ns, file in sorted(found)]
+
+
+def with_origin(text: str, origin: str) -> str:
+    """The text of an autosave; ``origin``: :func:`digest` of the file that its mapper has read or saved last."""
+    return f'{_ORIGIN}{origin}\n{text}'
+
+
+def _without_origin(text: str) -> str:
+    return text.partition('\n')[2] if text.startswith(_ORIGIN) else text
 
 
 def autosaved(path: Path) -> MapVersion | None:
-    """The newest of the :func:`autosaves` that can be read, if the map has not been written since."""
+    """The newest of the :func:`autosaves` that can be read and is not outdated."""
     usable = (entry for entry in reversed(autosaves(path)) if not (entry.problem or entry.outdated))
     return next(usable, None)
 
@@ -240,7 +253,7 @@ def take_up_autosave(path: Path, file: Path) -> None:
     with locked(path):
         text = read_text(file)
         parse_document(str(file), text)
-        replace(path, text, TAKE_UP)
+        replace(path, _without_origin(text), TAKE_UP)
         with suppress(OSError):
             file.unlink()
 
@@ -256,6 +269,6 @@ def put_autosave_aside(path: Path, file: Path) -> None:
         The autosave is too large for a map.
     """
     if file.is_file():
-        keep(path, _whatever(file), PUT_ASIDE)
+        keep(path, _without_origin(_whatever(file)), PUT_ASIDE)
         file.unlink(missing_ok=True)
         sync_folder(path.resolve().parent)

@@ -49,6 +49,8 @@ class MapKeeper:
         # Digests of the file that the map was made from, and of the one read last. 'nothing' matches no file: an unread
         # one is not overwritten.
         self._read = self._at_hand = 'nothing'
+        #: digest of the file as it was read or saved last, also of one that could not be read as a map
+        self._origin = ''
         self._own_autosave = False
         self._writer: Thread | None = None
         #: why the last autosave could not be written; empty if it was
@@ -84,7 +86,7 @@ class MapKeeper:
             There is no file, or it cannot be read.
         """
         self.finish()
-        digest = map_history.digest(self.path)
+        self._origin = digest = map_history.digest(self.path)
         marker_map = load_map(self.path, *self._sizes)
         self._at_hand = digest
         return marker_map
@@ -117,7 +119,7 @@ class MapKeeper:
         """The own autosave if it is to be resumed, and a message about it."""
         found, file = f'{entry.path} ({entry.content})', quote(str(self._path))
         if entry.problem or entry.outdated:
-            why = entry.problem or f'{found} was never saved, but the map has been written since'
+            why = entry.problem or f'{found} was never saved, but another map has been written since'
             return None, f'{why}; the next autosave moves it to {map_history.history_folder(self.path)}'
         try:
             age_s = time.time() - entry.path.stat().st_mtime
@@ -154,7 +156,7 @@ class MapKeeper:
         self.finish()
         self.obstacle = ''
         try:
-            self._read = map_history.save_with_history(self.path, marker_map, 'save', self._read)
+            self._read = self._origin = map_history.save_with_history(self.path, marker_map, 'save', self._read)
         except InputError as error:
             self.obstacle = str(error)
             path = self._save_elsewhere(marker_map, 'new')
@@ -218,7 +220,7 @@ class MapKeeper:
     def _autosave(self, marker_map: MarkerMap) -> None:
         file = self._autosave_file
         try:
-            text = dump_map(marker_map)
+            text = map_history.with_origin(dump_map(marker_map), self._origin)
             with locked(self.path), into(file):
                 if not self._own_autosave:
                     map_history.put_autosave_aside(self.path, file)

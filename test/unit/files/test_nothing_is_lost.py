@@ -172,12 +172,29 @@ def test_robots_that_map_into_one_file_keep_each_others_autosave(path, capsys):
     assert (mine.exists(), whole(other)) == (False, 3)
     again, note = MapKeeper(path, 0.3, {}, robot='drone2').recover(AUTOSAVE_S)
     assert again is None
-    assert f'{other} (revision 3, 60 markers) was never saved, but the map has been written since' in note
+    assert f'{other} (revision 3, 60 markers) was never saved, but another map has been written since' in note
     assert main(['map', 'history', str(path)]) == 0
     assert f'revision 3, 60 markers in {other}, before the map was written' in capsys.readouterr().out
     autosaved(second, grown(5))
     again, note = MapKeeper(path, 0.3, {}, robot='drone2').recover(AUTOSAVE_S)
     assert again.revision == 5, note
+
+
+def test_a_clock_that_begins_anew_with_each_flight_loses_no_autosave(path, capsys):
+    """Without a battery or a network it does: the map of the last flight was taken for later than what is flown now."""
+    autosaved(keeper_of(path), grown(2))
+    ahead = map_history.autosave_file(path).stat().st_mtime + 1200.0
+    os.utime(path, (ahead, ahead))
+    again, note = MapKeeper(path, 0.3, {}).recover(AUTOSAVE_S)
+    assert again.revision == 2, note
+    # Another map is another matter.
+    save_map(path, grown(7))
+    os.utime(path, (ahead, ahead))
+    assert MapKeeper(path, 0.3, {}).recover(AUTOSAVE_S)[0] is None
+    save_map(path, grown(1))
+    os.utime(path, (ahead, ahead))
+    assert main(['map', 'undo', str(path)]) == 0
+    assert (whole(path), path.read_text().partition('\n')[0]) == (2, 'format: thermal_fiducial/marker_map')
 
 
 @pytest.mark.parametrize('future', ['map', 'autosave', 'both'])
@@ -193,10 +210,10 @@ def test_files_of_a_later_release_are_named_and_stay(path, capsys, future):
     assert (recovered is None) == (future != 'map')
     assert str(copy) in note
     assert main(['map', 'history', str(path)]) == (0 if future == 'autosave' else 2)
-    words = 'revision 2, 60 markers in' if future == 'map' else f'{copy}: line 2: version: schema 2 is unknown'
+    words = 'revision 2, 60 markers in' if future == 'map' else f'{copy}: line 3: version: schema 2 is unknown'
     assert f'autosaved  {words}' in capsys.readouterr().out
     if future != 'map':
-        before = copy.read_text()
+        _, before = copy.read_text().split('\n', 1)
         autosaved(keeper_of(path) if future == 'autosave' else MapKeeper(path, 0.3, {}), grown(3))
         (file,) = map_history.history_folder(path).iterdir()
         assert file.read_text().endswith(before)
