@@ -24,7 +24,15 @@ from thermal_fiducial.files.csv_rows import csv_rows
 from thermal_fiducial.files.images import pictures_in
 from thermal_fiducial.files.reading import require_folder
 from thermal_fiducial.files.records import is_imu_reading
-from thermal_fiducial.files.rig_files import body_sensor, densities, of_camchain, of_rig, of_sensor, Rig
+from thermal_fiducial.files.rig_files import (
+    body_sensor,
+    densities,
+    LARGEST_OFFSET_S,
+    of_camchain,
+    of_rig,
+    of_sensor,
+    Rig,
+)
 from thermal_fiducial.files.trajectory_file import load_tum
 
 #: Columns of our files, in this order whether a header names them or not.
@@ -88,8 +96,29 @@ def read_recording(
     Raises
     ------
     InputError
-        None of the layouts, a missing file, or invalid content; the message names file and line.
+        None of the layouts, a missing file, invalid content, or frames and IMU of different times; the message names
+        file and line.
     """
+    recording = _read(folder, camera, camchain, imu)
+    _require_common_time(folder, recording)
+    return recording
+
+
+def _require_common_time(folder: Path, recording: Recording) -> None:
+    """Raise InputError unless frames and IMU samples overlap: those of two clocks, or two units, give no pose."""
+    frames = [
+        *(picture.stamp_ns for picture in recording.pictures),
+        *(frame.stamp_ns for frame in recording.corners),
+        *(pose.stamp_ns for pose in recording.poses),
+    ]
+    samples = [sample.stamp_ns for sample in recording.samples]
+    apart = max(min(frames) - max(samples), min(samples) - max(frames)) / SECOND_NS
+    if apart > LARGEST_OFFSET_S:
+        remark = f'frames and IMU samples are {apart:.3g} s apart'
+        raise InputError(f'{folder}: {remark}: are all stamps nanoseconds of one clock?')
+
+
+def _read(folder: Path, camera: str, camchain: Path | None, imu: Path | None) -> Recording:
     require_folder(folder)
     is_kalibr = (folder / 'imu0.csv').exists()
     if (camchain or imu) and not is_kalibr:

@@ -25,7 +25,9 @@ NOISE_NAMES = (
 )
 #: Largest noise densities, as the nodes take them.
 _LARGEST_NOISE = {name: item.metadata['maximum'] for name, item, _ in parameters(ImuNoise) if name in NOISE_NAMES}
-_LONGEST_SIDE, _LARGEST_OFFSET_S = 65_535, 1.0
+_LONGEST_SIDE = 65_535
+#: Largest offset between the clocks of camera and IMU [s]: the range of the parameter ``camera_time_offset``.
+LARGEST_OFFSET_S = 1.0
 #: Header of OpenCV in some of EuRoC's files, which YAML 1.1 does not allow.
 _OPENCV_HEAD = '%YAML:1.0'
 
@@ -194,7 +196,7 @@ def _lens(entry: Value, width: int, height: int, K: FloatArray, model: str, coef
 
 
 def _offset(fields: Mapping[str, Value], name: str) -> float:
-    return fields[name].number(-_LARGEST_OFFSET_S, _LARGEST_OFFSET_S) if name in fields else 0.0
+    return fields[name].number(-LARGEST_OFFSET_S, LARGEST_OFFSET_S) if name in fields else 0.0
 
 
 def _noise(section: Value | None) -> dict[str, float]:

@@ -134,6 +134,15 @@ def test_frames_may_come_before_the_clock_of_the_imu_begins(ours):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize('change', [lambda stamp: stamp // 1000, lambda stamp: stamp + 10**10])
+def test_frames_of_another_time_than_the_imu_are_refused(ours, capsys, change):
+    """In microseconds, say: the bag lasted 54 years, and its replay had no pose and no reason."""
+    corrupt(ours / 'cam1.csv', lambda text: re.sub(r'^\d+', lambda stamp: str(change(int(stamp[0]))), text, flags=re.M))
+    assert run(ours) == 2
+    assert 's apart: are all stamps nanoseconds of one clock?' in capsys.readouterr().err
+    assert not (ours.parent / 'bag').exists()
+
+
 def test_stamps_that_go_back_stay_in_the_bag(ours):
     lines = (ours / 'imu.csv').read_text().splitlines()
     lines[10], lines[11] = lines[11], lines[10]
