@@ -19,6 +19,7 @@ from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternio
 from thermal_fiducial.core.map_limits import LARGEST_COORDINATE
 from thermal_fiducial.core.measurements import CameraPose, CORNER_FIELDS, ImuSample
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
+from thermal_fiducial.core.wording import listed
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import csv_rows
 from thermal_fiducial.files.images import pictures_in
@@ -175,9 +176,7 @@ def _asl_truth(reference: Path, imu: Path) -> tuple[IntArray, FloatArray]:
 
 def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) -> Recording:
     chains = sorted(folder.glob('*camchain*.yaml'))
-    chain = camchain or next(iter(chains), None)
-    if chain is None:
-        raise InputError(f'{folder}: no camchain file beside the pictures: name it with --camchain')
+    chain = camchain or _only(folder, chains)
     noise = imu or next((path for path in sorted(folder.glob('*imu*.yaml')) if path not in [chain, *chains]), None)
     known = {} if noise is None else densities(noise)
     place = folder / camera
@@ -187,6 +186,15 @@ def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) 
         raise InputError(f'{place}: no pictures')
     pictures.sort(key=lambda picture: picture.stamp_ns)
     return Recording(of_camchain(chain, camera, known), imu_samples(folder / 'imu0.csv'), pictures=pictures)
+
+
+def _only(folder: Path, chains: list[Path]) -> Path:
+    """The camchain with the IMU, which Kalibr leaves beside that of the cameras alone; InputError for several."""
+    found = [path for path in chains if 'imucam' in path.name] or chains
+    if len(found) != 1:
+        there = listed([path.name for path in found]) if found else 'no camchain file beside the pictures'
+        raise InputError(f'{folder}: {there}: name one with --camchain')
+    return found[0]
 
 
 # --- tables -------------------------------------------------------------------------------------------

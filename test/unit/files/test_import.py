@@ -198,7 +198,7 @@ def test_a_ground_truth_without_attitude_is_refused(euroc, capsys):
     assert 'data.csv line 2: numbers, but none that were measured' in capsys.readouterr().err
 
 
-def test_kalibr(tmp_path):
+def test_kalibr(tmp_path, capsys):
     folder = tmp_path / 'flight'
     imu_csv(folder / 'imu0.csv', 'timestamp,omega_x,omega_y,omega_z,alpha_x,alpha_y,alpha_z')
     (folder / 'cam1').mkdir()
@@ -217,6 +217,13 @@ def test_kalibr(tmp_path):
     assert found[IMAGE_TOPIC][0][0] == FRAMES[0] + 18_000_000
     assert found[CAMERA_INFO_TOPIC][0][1].distortion_model == 'equidistant'
     np.testing.assert_array_equal(image_to_array(found[IMAGE_TOPIC][0][1]), (PICTURE >> 8).astype(np.uint8))
+    # Kalibr leaves that of the cameras alone beside it, whose name comes first. Of two calibrations neither is taken.
+    (folder / 'camchain-flight.yaml').write_text(yaml.safe_dump({'cam1': {}}))
+    assert run(folder, '--out', tmp_path / 'beside') == 0
+    assert parameters(tmp_path / 'beside') == values
+    (folder / 'camchain-imucam-2.yaml').write_text(yaml.safe_dump({'cam1': chain | {'timeshift_cam_imu': 0.5}}))
+    assert run(folder, '--out', tmp_path / 'either') == 2
+    assert 'camchain-imucam-2.yaml, camchain-imucam.yaml: name one with --camchain' in capsys.readouterr().err
     # Beside a newer one from elsewhere the camchain of the folder is no file of the IMU.
     (tmp_path / 'newer.yaml').write_text(yaml.safe_dump({'cam1': chain | {'timeshift_cam_imu': 0.001}}))
     assert run(folder, '--camchain', tmp_path / 'newer.yaml', '--out', tmp_path / 'again') == 0
