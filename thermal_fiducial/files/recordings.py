@@ -177,8 +177,7 @@ def _asl_truth(reference: Path, imu: Path) -> tuple[IntArray, FloatArray]:
 def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) -> Recording:
     chains = sorted(folder.glob('*camchain*.yaml'))
     chain = camchain or _only(folder, chains)
-    noise = imu or next((path for path in sorted(folder.glob('*imu*.yaml')) if path not in [chain, *chains]), None)
-    known = {} if noise is None else densities(noise)
+    known = densities(imu) if imu else _densities_in(folder, [chain, *chains])
     place = folder / camera
     require_folder(place)
     pictures = [Picture(_stamp(str(path), path.stem), path) for path in pictures_in(place)]
@@ -195,6 +194,16 @@ def _only(folder: Path, chains: list[Path]) -> Path:
         there = listed([path.name for path in found]) if found else 'no camchain file beside the pictures'
         raise InputError(f'{folder}: {there}: name one with --camchain')
     return found[0]
+
+
+def _densities_in(folder: Path, chains: list[Path]) -> dict[str, float]:
+    """Those of the IMU files in the folder, which Kalibr leaves twice; raises InputError for different ones."""
+    given = {path.name: densities(path) for path in sorted(folder.glob('*imu*.yaml')) if path not in chains}
+    known = {name: noise for name, noise in given.items() if noise}
+    first = next(iter(known.values()), {})
+    if any(noise != first for noise in known.values()):
+        raise InputError(f'{folder}: {listed(known)}: different noise densities: name one with --imu')
+    return first
 
 
 # --- tables -------------------------------------------------------------------------------------------

@@ -217,6 +217,15 @@ def test_kalibr(tmp_path, capsys):
     assert found[IMAGE_TOPIC][0][0] == FRAMES[0] + 18_000_000
     assert found[CAMERA_INFO_TOPIC][0][1].distortion_model == 'equidistant'
     np.testing.assert_array_equal(image_to_array(found[IMAGE_TOPIC][0][1]), (PICTURE >> 8).astype(np.uint8))
+    # Kalibr leaves a copy of the IMU file; others may have "imu" in their names. Of two that differ neither is taken.
+    (folder / 'a-imu.yaml').write_text(yaml.safe_dump({'imu0': NOISE | {'update_rate': 200.0}}))
+    (folder / 'a-imu-filter.yaml').write_text(yaml.safe_dump({'window': 5}))
+    assert run(folder, '--out', tmp_path / 'twice') == 0
+    assert parameters(tmp_path / 'twice') == values
+    (folder / 'b-imu.yaml').write_text(yaml.safe_dump(NOISE | {'gyroscope_noise_density': 2e-3}))
+    assert run(folder, '--out', tmp_path / 'two') == 2
+    assert 'a-imu.yaml, b-imu.yaml, imu.yaml: different noise densities: name one' in capsys.readouterr().err
+    (folder / 'b-imu.yaml').unlink()
     # Kalibr leaves that of the cameras alone beside it, whose name comes first. Of two calibrations neither is taken.
     (folder / 'camchain-flight.yaml').write_text(yaml.safe_dump({'cam1': {}}))
     assert run(folder, '--out', tmp_path / 'beside') == 0
