@@ -221,9 +221,10 @@ def autosaves(path: Path) -> list[MapVersion]:
         own = autosave_file(path)
         since_ns = path.stat().st_mtime_ns if path.exists() else 0
         for file in (own, *own.parent.glob(f'{glob.escape(own.name)}.*')):
-            # A mapper that runs may save, and delete it.
+            # A mapper that runs may save, and delete it; one that was edited has a history of its own beside it.
             with suppress(OSError):
-                found.append((file.stat().st_mtime_ns, file))
+                if file.is_file():
+                    found.append((file.stat().st_mtime_ns, file))
     return [_entry(file, 0, present if written_ns < since_ns else '') for written_ns, file in sorted(found)]
 
 

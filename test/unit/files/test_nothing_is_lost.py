@@ -219,6 +219,17 @@ def test_files_of_a_later_release_are_named_and_stay(path, capsys, future):
         assert file.read_text().endswith(before)
 
 
+def test_an_autosave_that_was_edited_is_one_autosave(path):
+    """Its history, a folder, was taken for that of another robot."""
+    autosaved(keeper_of(path), grown(2))
+    copy = map_history.autosave_file(path)
+    assert main(['map', 'unfix', str(copy), '0']) == 0
+    assert map_history.history_folder(copy).exists()
+    assert [entry.path for entry in map_history.autosaves(path)] == [copy]
+    _, note = MapKeeper(path, 0.3, {}).recover(AUTOSAVE_S)
+    assert 'another robot' not in note
+
+
 def test_a_map_that_was_saved_beside_its_file_leaves_no_autosave(path):
     """The next mapper resumed it, with the words that the last one had not ended in order, over what was edited."""
     keeper = keeper_of(path)
